@@ -125,6 +125,7 @@ class EpisodeRunner:
         if not self._continuous:
             self.backup_plan.reset()
             self._memory.reset()
+        self.backup_plan.acceleration_age = self.info.get("acceleration_age", self.backup_plan.acceleration_age)
         self._fill_scan()
         self.episode, self.step, self._decided_step, self.running = episode, 0, 0, True
         self.rng = self.identity.exploration(episode)

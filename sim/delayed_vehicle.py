@@ -13,6 +13,8 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle
 
+LEARNED = "brakeline.deploy.learned_vehicle:simulated"
+
 
 class DelayedVehicle:
     """A vehicle that carries out each input one period later; zero during the first period.
@@ -24,6 +26,7 @@ class DelayedVehicle:
         self._vehicle, self._robot = vehicle, robot
         self.input: Array = np.zeros(robot.action_dim)
         self.initial_period, self.alter = vehicle.initial_period, vehicle.alter
+        self.acceleration_age = acceleration_age_of(vehicle)
 
     @property
     def true(self) -> Array:
@@ -41,6 +44,11 @@ class DelayedVehicle:
         return period
 
 
+def acceleration_age_of(vehicle: Vehicle) -> float:
+    """Return the age of the horizontal acceleration in a vehicle's measured states [s]; 0 if it states none."""
+    return float(getattr(vehicle, "acceleration_age", 0.0))
+
+
 def delayed(make: MakeVehicle, robot: Robot) -> MakeVehicle:
     """Return a function that makes the same vehicles with the delay of real time."""
 
@@ -51,17 +59,22 @@ def simulated_vehicle(robot: RobotWithTask, conditions: Conditions, tap: object 
     """Return a function that makes the vehicles of a robot's task under some conditions.
 
     A robot in real time gets delayed vehicles. A simulator behind MAVLink calls `tap` with every frame. A simulator
-    that has an argument `robot` gets the robot, and can refuse what it cannot simulate.
+    that has an argument `robot` gets the robot, and can refuse what it cannot simulate. With `conditions.learned`, the
+    robot's model set simulates it.
 
     Raises:
         UnknownTask: the code that the task names cannot be loaded.
         Mismatch: the simulator moves another robot than the one that the description states.
     """
+    make: MakeVehicle
+    if conditions.learned:  # of a robot in real time, the data are its own
+        make = robot.task.code(LEARNED)(conditions, tap, robot=robot)
+        return delayed(make, robot) if robot.late else make
     if robot.late:
         return delayed(simulated_vehicle(robot.in_lockstep(), conditions, tap), robot)
     code = robot.task.code(robot.task.simulator)
     described = {"robot": robot} if "robot" in signature(code).parameters else {}
-    make: MakeVehicle = code(conditions, tap, **described)
+    make = code(conditions, tap, **described)
     return make
 
 

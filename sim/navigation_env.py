@@ -20,7 +20,7 @@ from brakeline.messaging.obstacle import Array, Obstacle
 from brakeline.messaging.task import Reward, RobotWithTask, arena_kind, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
-from brakeline.sim.delayed_vehicle import simulated_vehicle
+from brakeline.sim.delayed_vehicle import acceleration_age_of, simulated_vehicle
 from brakeline.sim.ground_estimator import wrap
 from brakeline.sim.observations import ObservationModel
 from brakeline.sim.range_sensors import make_scanner
@@ -123,6 +123,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     subsamples         (S, d) m: estimated positions within the last period, in the robot's frame at its start
     turned             rad: estimated change of heading over the last period
     episode_seed       the value that `options` takes to repeat this episode
+    acceleration_age   s, age of the horizontal acceleration in the measured state
     =================  =================================================================================
     """
 
@@ -335,4 +336,5 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "at_goal": self._at_goal(period),
             "speed": self._observation_model.speed(period.true),
             "episode_seed": self._episode_seed,
+            "acceleration_age": acceleration_age_of(self.vehicle),
         }

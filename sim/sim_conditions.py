@@ -168,6 +168,7 @@ OPTIONAL = {
     "weak_motor": "weak motor",
     "wind": "wind",
     "process_noise": "disturbances of the motion",
+    "learned": "motion by a model set",
 }
 
 
@@ -177,6 +178,7 @@ class Conditions:
 
     `noise` counts for robots on the floor and `flight_noise` for those in the air, which ignore the other one.
     weak_motor: share of its force that one motor keeps.
+    learned: the robot's model set simulates it, in place of the simulator of its task.
     """
 
     noise: NoiseLevels = field(default_factory=NoiseLevels)
@@ -187,6 +189,7 @@ class Conditions:
     perception: Perception = field(default_factory=Perception)
     process_noise: ProcessNoise = field(default_factory=ProcessNoise)
     weak_motor: float = 1.0
+    learned: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.payload_kg) and self.payload_kg >= 0.0):
@@ -222,6 +225,8 @@ class Conditions:
         values |= {f"flight_{name}": value for name, value in asdict(self.flight_noise).items()}
         values |= {f"wind_{name}": value for name, value in asdict(self.wind).items()}
         texts = {name: "drawn" if value is None else f"{value:g}" for name, value in values.items()}
+        if self.learned:
+            texts["learned"] = "True"
         if self.perception.kind == "map":
             return texts
         faults = {f"scan_{name}": f"{value:g}" for name, value in asdict(self.perception.faults).items()}

@@ -21,7 +21,7 @@ class ActorCommand:
     robot: options.Robot = "ground"
     endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
     filtering: options.Unprefixed[options.FilterOptions] = field(default_factory=options.FilterOptions)
-    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
+    physics: options.Unprefixed[options.SimulationOptions] = field(default_factory=options.SimulationOptions)
     name: str = f"actor-{os.uname().nodename.split('.')[0]}"
     """Give the actor this name on the bus. Each actor of a run needs its own."""
     number: int = 0

@@ -185,6 +185,19 @@ class PhysicsOptions:
 
 
 @dataclass(frozen=True)
+class SimulationOptions(PhysicsOptions):
+    """Set how the simulated robot differs from the robot that was recorded, or let its model set simulate it."""
+
+    learned: bool = False
+    """Simulate the robot by its model set of mode one-step, made of its own log, instead of by the simulator of its
+    task."""
+
+    def conditions(self) -> Conditions:
+        """Return the simulator's conditions for these options. Raises ValueError if the options contradict."""
+        return replace(super().conditions(), learned=self.learned)
+
+
+@dataclass(frozen=True)
 class FlightOptions(FlightSettings):
     """Describe the vehicle behind a MAVLink link, and its place in the arena."""
 

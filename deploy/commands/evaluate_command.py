@@ -26,7 +26,7 @@ class EvaluateCommand:
     astar, careful (astar far from obstacles), the folder of a run, a weights file, FILE.py:CLASS, or a CSV
     file of inputs as `brakeline excite` prints them."""
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
-    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
+    physics: options.Unprefixed[options.SimulationOptions] = field(default_factory=options.SimulationOptions)
     arena: options.ArenaName = "default"
     episodes: int = 100
     """Drive this many episodes. A fleet counts those of all its robots, and completes each world."""

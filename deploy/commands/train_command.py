@@ -26,7 +26,7 @@ class TrainCommand(RunConfig):
     """Train for this many steps of each robot kind. 0 takes the steps of the experiment, of the resumed run, or of the
     logs if there is no actor."""
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
-    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
+    physics: options.Unprefixed[options.SimulationOptions] = field(default_factory=options.SimulationOptions)
     experiment: str = "default"
     """Start from this configuration, which the other options change: default, demo or debug."""
     out: options.RunFolder = None

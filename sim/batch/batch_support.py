@@ -27,6 +27,8 @@ def check_vehicles(robot: RobotWithTask, conditions: Conditions) -> None:
         NoBatch: they can only be simulated one by one.
         ValueError: no simulator of this robot has such conditions.
     """
+    if conditions.learned:
+        raise NoBatch(f"a robot that its model set simulates (--learned) is not simulated in batches: {ADVICE}")
     if (robot.layout(), robot.task.simulator) not in SIMULATED:
         raise NoBatch(f"{robot.name} with the task {robot.task.name} is not simulated in batches: {ADVICE}")
     if robot.position_dim == 3 and not conditions.wind.calm:

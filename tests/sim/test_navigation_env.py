@@ -42,7 +42,7 @@ from tests.robots import GROUND, QUADROTOR
 INFO_KEYS = {
     *("robot", "state", "true_state", "outside", "input_in_force", "obstacles", "arena", "goal", "time"),
     *("collision", "contact_moving", "contact_robot", "contact_standing", "at_goal"),
-    *("clearance", "closest", "speed", "subsamples", "turned", "episode_seed"),
+    *("clearance", "closest", "speed", "subsamples", "turned", "episode_seed", "acceleration_age"),
 }
 ENVS = {
     "ground": partial(NavigationEnv, GROUND),
