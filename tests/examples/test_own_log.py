@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from brakeline.deploy import cli
 from brakeline.messaging.robot import robot_named
 from tests.examples.programs import EXAMPLES, run_program
 
@@ -39,3 +41,18 @@ def test_four_minutes_give_a_filter(tmp_path):
         assert row[driver]["episodes"] == episodes and row[driver]["collisions"] == 0
     assert 0.0 < row["adversary"]["nearest"] < 0.06 and row["adversary"]["decisions"]["adjusted"] > 0.5
     assert row["planner"]["goals"] >= 9
+
+
+def test_the_model_set_of_a_log_simulates_the_robot_and_the_robot_itself_judges_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    skid, log = str(EXAMPLES / "own_log" / "skid.toml"), tmp_path / "skid.csv"
+    Path(log).write_text(run_program("own_log/drive.py", "skid", "--minutes", "4", "--seed", "1"))
+    assert cli.main(["import", str(log), "--robot", skid, "-q"]) == 0
+    assert cli.main(["certify", skid, "--use", "-q"]) == 0
+    capsys.readouterr()
+    for learned in ((), ("--learned",)):
+        assert cli.main(["evaluate", skid, *learned, "--policy", "astar", "--episodes", "3", "--json"]) == 0
+        figures = json.loads(capsys.readouterr().out)
+        assert (figures["episodes"], figures["goals"], figures["collisions"]) == (3, 3, 0)
+        assert figures["containment"]["violations"] == 0 < figures["containment"]["steps"]
+        assert figures["conditions"].get("learned") == ("True" if learned else None)
