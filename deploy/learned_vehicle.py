@@ -24,10 +24,79 @@ from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 
 SAMPLES = 5  # of the position in a period
-# Standard deviation of an error, as a share of the half-width of the set after one period. In two first flights, of an
-# ArduCopter and a PX4, it was 0.11 to 0.25, by coordinate.
-ERROR_SHARE = 0.15
-MOST_ERROR = 0.95  # of a half-width
+TRIED_ERROR = 0.05  # standard deviation of an error, as a share of the half-width of the set after one period
+LARGEST_ERROR = 0.25  # the same. In two first flights, of an ArduCopter and a PX4, it was 0.11 to 0.25, by coordinate
+MOST_ERROR = 0.95  # of that half-width
+TRIALS = 500  # stops by which the size of the errors is chosen
+
+
+class LearnedMotion:
+    """The motion of many robots that a model set predicts, with random errors in each period.
+
+    Attributes:
+        model: the model set, of mode one-step. robot: its robot.
+        error_share: standard deviation of an error, as a share of the half-width of the set after one period. It is as
+            large as possible, so that errors add up to no more than the sets of a plan: a set that the robot left
+            would say nothing about the robot. Of `TRIALS` stops from inputs at random, 99 % stay in all their sets.
+    """
+
+    def __init__(self, model: ModelSet) -> None:
+        assert model.one_step is not None
+        self.model, self.robot, self._predictor = model, model.robot, model.one_step
+        self._measured = list(self.robot.regressor)
+        self._least, self._most = model.domain[:, : len(self._measured)]  # recorded
+        self.error_share = min(TRIED_ERROR / self._share_used(), LARGEST_ERROR)
+
+    def after_one_period(self, state: Array, before: Array, input: Array, errors: Array) -> tuple[Array, Array]:
+        """Return the states (T, n) after a period, and the changes (T, n): of the pose in the frame of its start.
+
+        Args:
+            state: (T, n). before, input (T, m): inputs of the period before, and of this one.
+            errors (T, n): as shares of the half-widths of the set after one period.
+        """
+        robot, n, d = self.robot, self.robot.state_dim, self.robot.position_dim
+        window = np.hstack([state[:, self._measured], before, np.tile(input, (1, robot.horizon))])
+        most = self.model.steps[0].half_widths(window)[:, :n] * self._predictor.stretches(robot, window)[:, :1]
+        change = self._predictor.rollouts(robot, window)[:, 0, :n] + errors * most
+        # Beyond what was recorded, a predictor can diverge.
+        change[:, self._measured] = np.clip(change[:, self._measured], self._least, self._most)
+        after, turn = change.copy(), self.turns(state)
+        after[:, :d] = state[:, :d] + np.einsum("tij,tj->ti", turn, change[:, :d])
+        if robot.heading is not None:
+            heading = state[:, robot.heading] + change[:, robot.heading]
+            after[:, robot.heading] = (heading + np.pi) % (2.0 * np.pi) - np.pi
+        return after, change
+
+    def turns(self, states: Array) -> Array:
+        """Return the rotations (T, d, d) from the robot's frame to the world in states (T, n)."""
+        if self.robot.heading is None:
+            return np.broadcast_to(np.eye(self.robot.position_dim), (len(states), *(self.robot.position_dim,) * 2))
+        cos, sin = np.cos(states[:, self.robot.heading]), np.sin(states[:, self.robot.heading])
+        return np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
+
+    def errors(self, rng: np.random.Generator, share: float, count: int = 1) -> Array:
+        """Return random errors (count, n) for `after_one_period`."""
+        return np.clip(share * rng.standard_normal((count, self.robot.state_dim)), -MOST_ERROR, MOST_ERROR)
+
+    def _share_used(self) -> float:
+        """Return the share of a plan's sets of positions that errors of TRIED_ERROR use: 99 % of stops use less."""
+        robot, d, rng = self.robot, self.robot.position_dim, np.random.default_rng(0)
+        inputs = rng.uniform(robot.low(), robot.high(), (TRIALS, robot.action_dim))
+        start = np.array([robot.state_at_inputs(u) for u in inputs])
+        start[:, self._measured] = np.clip(start[:, self._measured], self._least, self._most)
+        stops = inputs[:, None] * robot.stop_profile()[None, : robot.horizon]
+        window = np.hstack([start[:, self._measured], inputs, stops.reshape(TRIALS, -1)])
+        expected = self._predictor.rollouts(robot, window)[..., :d]
+        state, before, used = start, inputs, np.zeros(TRIALS)
+        stretches = self._predictor.stretches(robot, window)
+        for i, step in enumerate(self.model.steps):
+            errors = self.errors(rng, TRIED_ERROR, TRIALS)
+            state, _ = self.after_one_period(state, before, stops[:, i], errors)
+            before = stops[:, i]
+            most = step.half_widths(window)[:, :d] * stretches[:, i : i + 1]
+            off = np.einsum("tji,tj->ti", self.turns(start), state[:, :d] - start[:, :d]) - expected[:, i]
+            used = np.maximum(used, (np.abs(off) / most).max(axis=1))
+        return float(np.quantile(used, 0.99))
 
 
 class LearnedVehicle(SimulatedVehicle):
@@ -38,7 +107,7 @@ class LearnedVehicle(SimulatedVehicle):
 
     samples = SAMPLES
 
-    def __init__(self, arena: Arena, rng: np.random.Generator, model: ModelSet) -> None:
+    def __init__(self, arena: Arena, rng: np.random.Generator, motion: LearnedMotion) -> None:
         """Put the robot at the start of an arena, at rest.
 
         Raises:
@@ -46,63 +115,38 @@ class LearnedVehicle(SimulatedVehicle):
         """
         if arena.crowd is not None:
             raise ValueError(f"a robot that is simulated by its model set meets no moving obstacles: {arena.name}")
-        assert model.one_step is not None
-        self.arena, self.robot, self._rng, self._predictor = arena, model.robot, rng, model.one_step
-        self._half_widths, self.acceleration_age = model.steps[0].half_widths, model.acceleration_age
-        self._least, self._most = model.domain[:, : len(model.robot.regressor)]  # recorded
+        self.arena, self.robot, self._rng, self._motion = arena, motion.robot, rng, motion
+        self.acceleration_age = motion.model.acceleration_age
         robot, d = self.robot, self.robot.position_dim
         self.true = np.zeros(robot.state_dim)
         self.true[:d] = arena.start[:d]
         if robot.heading is not None:
             self.true[robot.heading] = arena.start[d]
-        self._centers, self._radii = (
-            np.array([getattr(disc, name) for disc in robot.body]) for name in ("at", "radius")
-        )
+        self._centers = np.array([disc.at for disc in robot.body])
+        self._radii = np.array([disc.radius for disc in robot.body])
         self.measured, self.input = self.true, robot.zero_input()
 
     def step(self, input: Array) -> Period:
         """Move for one period; see `Vehicle.step`."""
-        robot, d = self.robot, self.robot.position_dim
-        start, before, self.input = self.true, self.input, robot.clip_input(input, self.input)
-        change = self._after_one_period(before)
-        moved, turn, turned = change[:d].copy(), self._turn(start), 0.0
-        change[:d] = start[:d] + turn @ moved
-        if robot.heading is not None:
-            turned = float(change[robot.heading])
-            change[robot.heading] = (start[robot.heading] + turned + np.pi) % (2.0 * np.pi) - np.pi
-        self.true = self.measured = change
+        motion, heading, d = self._motion, self.robot.heading, self.robot.position_dim
+        start, before, self.input = self.true, self.input, self.robot.clip_input(input, self.input)
+        errors = motion.errors(self._rng, motion.error_share)
+        after, change = motion.after_one_period(start[None], before[None], self.input[None], errors)
+        self.true = self.measured = after[0]
         shares = np.linspace(0.0, 1.0, SAMPLES + 1)[1:, None]
-        states = np.tile(start, (SAMPLES, 1))
-        states[:, :d] += shares * (turn @ moved)
-        if robot.heading is not None:
-            states[:, robot.heading] += shares[:, 0] * turned
-        return self._report(bool(self.clearance(states).min() <= 0.0), states, shares * moved, turned)
-
-    def _after_one_period(self, before: Array) -> Array:
-        """Return the outputs of the predictor (n,) with errors: position and heading as changes, in the robot's frame.
-
-        before (m,): the input of the period before.
-        """
-        robot, n = self.robot, self.robot.state_dim
-        window = np.concatenate([self.true[list(robot.regressor)], before, np.tile(self.input, robot.horizon)])[None]
-        most = self._half_widths(window)[0, :n] * self._predictor.stretches(robot, window)[0, 0]
-        error = np.clip(ERROR_SHARE * self._rng.standard_normal(n), -MOST_ERROR, MOST_ERROR)
-        after = self._predictor.rollouts(robot, window)[0, 0, :n] + error * most
-        measured = list(robot.regressor)  # beyond what was recorded, a predictor can diverge
-        after[measured] = np.clip(after[measured], self._least, self._most)
-        return np.asarray(after)
-
-    def _turn(self, state: Array) -> Array:
-        """Return the rotation (d, d) from the robot's frame to the world."""
-        if self.robot.heading is None:
-            return np.eye(self.robot.position_dim)
-        cos, sin = np.cos(state[self.robot.heading]), np.sin(state[self.robot.heading])
-        return np.array([[cos, -sin], [sin, cos]])
+        states, turned = np.tile(start, (SAMPLES, 1)), 0.0
+        states[:, :d] += shares * (after[0, :d] - start[:d])
+        if heading is not None:
+            turned = float(change[0, heading])
+            states[:, heading] += shares[:, 0] * turned
+        return self._report(bool(self.clearance(states).min() <= 0.0), states, shares * change[:, :d], turned)
 
     def clearance(self, states: Array) -> Array:
         """Return the distance [m] from the nearest disc of the body in states (S, n) to the nearest obstacle."""
-        d = self.robot.position_dim
-        centers = np.stack([state[:d] + self._centers @ self._turn(state).T for state in np.atleast_2d(states)])
+        states = np.atleast_2d(states)
+        centers = states[:, None, : self.robot.position_dim] + np.einsum(
+            "sij,kj->ski", self._motion.turns(states), self._centers
+        )
         return np.asarray((self.arena.shapes.distance(centers).min(axis=0) - self._radii).min(axis=-1))
 
 
@@ -124,4 +168,4 @@ def simulated(conditions: Conditions, tap: object = None, *, robot: Robot) -> Ma
     model = ModelSet.load(path)
     if model.robot.layout() != robot.layout():
         raise Mismatch(f"{path}: the model set is about another {robot.name}: certify this one")
-    return partial(LearnedVehicle, model=model)
+    return partial(LearnedVehicle, motion=LearnedMotion(model))
