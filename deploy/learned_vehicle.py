@@ -1,4 +1,4 @@
-"""Simulate a robot by a model set made from its own log (docs/environments.md).
+"""Simulate a robot by a model set made from its own log (docs/your_robot.md).
 
 A robot may exist only in a log: nobody wrote a simulator of it. Its model set of mode one-step predicts one control
 period (docs/method.md §13). Rolled out with random errors, this is a simulator that moves about as the robot does,
@@ -20,6 +20,7 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.model_config import ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.sim.arena import Arena
+from brakeline.sim.ground_estimator import wrap
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 
@@ -65,8 +66,7 @@ class LearnedMotion:
         after, turn = change.copy(), self.turns(state)
         after[:, :d] = state[:, :d] + np.einsum("tij,tj->ti", turn, change[:, :d])
         if robot.heading is not None:
-            heading = state[:, robot.heading] + change[:, robot.heading]
-            after[:, robot.heading] = (heading + np.pi) % (2.0 * np.pi) - np.pi
+            after[:, robot.heading] = wrap(state[:, robot.heading] + change[:, robot.heading])
         return after, change
 
     def turns(self, states: Array) -> Array:
@@ -124,8 +124,6 @@ class LearnedVehicle(SimulatedVehicle):
         self.true[:d] = arena.start[:d]
         if robot.heading is not None:
             self.true[robot.heading] = arena.start[d]
-        self._centers = np.array([disc.at for disc in robot.body])
-        self._radii = np.array([disc.radius for disc in robot.body])
         self.measured, self.input = self.true, robot.zero_input()
 
     def step(self, input: Array) -> Period:
@@ -142,14 +140,6 @@ class LearnedVehicle(SimulatedVehicle):
             turned = float(change[0, heading])
             states[:, heading] += shares[:, 0] * turned
         return self._report(bool(self.clearance(states).min() <= 0.0), states, shares * change[:, :d], turned)
-
-    def clearance(self, states: Array) -> Array:
-        """Return the distance [m] from the nearest disc of the body in states (S, n) to the nearest obstacle."""
-        states = np.atleast_2d(states)
-        centers = states[:, None, : self.robot.position_dim] + np.einsum(
-            "sij,kj->ski", self._motion.turns(states), self._centers
-        )
-        return np.asarray((self.arena.shapes.distance(centers).min(axis=0) - self._radii).min(axis=-1))
 
 
 def simulated(conditions: Conditions, tap: object = None, *, robot: Robot) -> MakeVehicle:

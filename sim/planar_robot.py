@@ -41,8 +41,6 @@ class PlanarRobot(SimulatedVehicle):
         # model, data: MuJoCo's
         self.model, self.data = self._physics.model, self._physics.data
         self._bound = np.asarray(robot.measurement_bound)
-        self._discs = np.array([disc.at[:2] for disc in robot.body])  # in the robot's frame
-        self._radii = np.array([disc.radius for disc in robot.body])
         self._rng, self._noise = rng, noise.scale
         self._odometry_scale = 1.0 + float(cut_normal(rng, self._noise * SCALE_ERROR, ()))
         self.input = np.zeros(robot.action_dim)  # (m,) input executed last
@@ -96,9 +94,3 @@ class PlanarRobot(SimulatedVehicle):
         measured = self.true + cut_normal(self._rng, 0.5 * self._noise, self._bound.shape) * self._bound
         measured[2] = wrap(float(measured[2]))
         return np.asarray(measured)
-
-    def clearance(self, states: Array) -> Array:
-        """Return the distance [m] from the nearest disc of the body at poses (..., 3) to the nearest obstacle."""
-        turned = rotate(np.broadcast_to(self._discs, (*states.shape[:-1], *self._discs.shape)), states[..., 2, None])
-        centres = states[..., None, :2] + turned
-        return np.asarray((self.arena.shapes.distance(centres).min(axis=0) - self._radii).min(axis=-1))

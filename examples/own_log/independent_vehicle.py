@@ -23,8 +23,6 @@ class IndependentVehicle(SimulatedVehicle):
     def __init__(self, arena: Arena, rng: np.random.Generator, robot: Robot) -> None:
         self.robot, self.arena, self.samples = robot, arena, round(robot.period / SAMPLE)
         self._simulator = Simulator(VEHICLES[robot.kind], rng, np.array([arena.start]))
-        self._centers = np.array([disc.at for disc in robot.body])
-        self._radii = np.array([disc.radius for disc in robot.body])
         self.input = robot.zero_input()
         self.true, self.measured = self._simulator.state[:, 0], self._simulator.measure()[0]
 
@@ -39,11 +37,6 @@ class IndependentVehicle(SimulatedVehicle):
         path[-1] = (self.measured[:2] - start) @ _rotation(heading)
         hit = bool(self.clearance(poses).min() <= 0.0)
         return self._report(hit, poses, path, float(self.measured[2] - heading))
-
-    def clearance(self, states: Array) -> Array:
-        """Return the distance [m] from the nearest disc of the body at poses (S, 3) to the nearest obstacle."""
-        centers = np.stack([pose[:2] + self._centers @ _rotation(pose[2]).T for pose in np.atleast_2d(states)])
-        return np.asarray((self.arena.shapes.distance(centers).min(axis=0) - self._radii).min(axis=-1))
 
 
 def _rotation(heading: float) -> Array:

@@ -55,7 +55,8 @@ class PlanInputs:
         narrower: the inputs that were recorded leave out some of those that the description allows.
         nothing (m,): zero input.
         schedule (N·m, (F + given)·m): S of docs/method.md §2, from the chosen inputs to all inputs of a plan.
-        pattern (n, m): the inputs of `spread`, from -1 (smallest) to 1 (largest).
+        pattern (n, m): inputs that a search tries where its QPs find nothing, from -1 (the least that bounds and slew
+            allow) to 1 (the most).
         braking (F, m): share of its value that an input still has in each free period while the robot brakes.
     """
 
@@ -102,17 +103,6 @@ class PlanInputs:
     def regressors(self, z_0: Array, action: Array) -> Array:
         """Return z (nz,) of an action (m,) followed by braking."""
         return regressors_of_braking(z_0, self.braking, action)
-
-    def spread(self, before: Array) -> Array:
-        """Return inputs (n, m) all over what bounds and slew allow after `before` (m,): ends and middles, combined.
-
-        A robot of more than three inputs gets one changed at a time: the combinations would be too many.
-        """
-        low, high = (
-            self.limited(np.full_like(before, -np.inf), before),
-            self.limited(np.full_like(before, np.inf), before),
-        )
-        return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * self.pattern)
 
     def plan(self, z: Array) -> Array:
         """Return all inputs (N, m) of the plan with regressors z."""

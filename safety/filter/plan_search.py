@@ -147,7 +147,7 @@ class PlanSearch:
             if adjusted is not None:
                 break
         for_clearance = margin >= 0.0 and adjusted is not None
-        adjusted = self._turned_only(adjusted) or adjusted or self._spread_out()
+        adjusted = self._turned_only(adjusted) or adjusted or self._of_pattern()
         if adjusted is not None:
             adjusted.for_clearance = for_clearance
         else:
@@ -236,16 +236,18 @@ class PlanSearch:
         margin = constraints.margin_in(local_map, z)
         return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, constraints) if margin >= 0.0 else None
 
-    def _spread_out(self) -> PlanCandidate | None:
-        """Return a verified plan near one of the inputs of `PlanInputs.spread`, where a rollout's QPs found none.
+    def _of_pattern(self) -> PlanCandidate | None:
+        """Return a verified plan from one of the inputs of `PlanInputs.pattern`, where a rollout's QPs found none.
 
-        A QP is as good as its linearisation. In flights of an ArduCopter among dense obstacles, the QPs missed one
-        decision in sixteen for which a grid of inputs had a verified plan.
+        A QP is as good as its linearisation. In a flight of an ArduCopter among dense obstacles, 9 of 60 decisions to
+        brake had a verified alternative on a grid of 125 inputs. The pattern finds 7 of them.
         """
-        inputs = self.safety.inputs
+        inputs, m = self.safety.inputs, len(self.proposal)
         if not isinstance(self.safety.tube, RolloutTube):
             return None
-        for z in sorted((inputs.regressors(self.z_0, u) for u in inputs.spread(self.before)), key=self._off):
+        middle, change = (part[:m] for part in self.safety.builder.reachable(self.before))
+        tried = (inputs.regressors(self.z_0, middle + change * share) for share in inputs.pattern)
+        for z in sorted(tried, key=self._off):
             at = self._around(z)
             margin = at.constraints.least(at.slack, z)
             if margin >= 0.0:

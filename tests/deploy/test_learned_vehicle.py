@@ -118,7 +118,7 @@ def test_each_disc_of_the_body_can_collide() -> None:
     assert vehicle.step(np.zeros(2)).collision
     vehicle.true = towards - [0.0, 0.0, 0.3, 0.0, -1.5]
     turning = vehicle.step(np.array([0.0, 1.5]))
-    assert turning.turned > 0.1 and turning.clearance == pytest.approx(vehicle.clearance(turning.true)[0])
+    assert turning.turned > 0.1 and turning.clearance == pytest.approx(vehicle.clearance(turning.true))
 
 
 def test_speeds_stay_within_the_recorded_ones(monkeypatch) -> None:

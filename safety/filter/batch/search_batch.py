@@ -147,21 +147,18 @@ class SearchBatch:
                 candidates.adjusted[to], candidates.allowed[to] = changed, ~changed
                 candidates.for_clearance[to] = xp.take(verified, to, axis=0) & changed
                 open_ = open_[~solved & ~unsure]
-        candidates.hopeless[open_] = self._nothing_spread_out(taken(xp, lanes, open_))
+        candidates.hopeless[open_] = self._none_of_pattern(taken(xp, lanes, open_))
         return candidates
 
-    def _nothing_spread_out(self, lanes: LaneBatch) -> Array:
-        """Return the lanes (B,) for which no input of `PlanInputs.spread` is verified; others need the single path."""
+    def _none_of_pattern(self, lanes: LaneBatch) -> Array:
+        """Return the lanes (B,) for which no input of `PlanInputs.pattern` is verified; others need the single path."""
         xp, before = self._xp, lanes.z_0[self.known - self._m :]
         none = xp.ones_like(before[0], dtype=xp.bool)
         if self.constraints.tube.linear or not none.shape[0]:
             return none
-        low, high = (
-            self.limited(xp.full_like(before, -xp.inf), before),
-            self.limited(xp.full_like(before, xp.inf), before),
-        )
+        middle, change = (part[: self._m] for part in self._qp.reachable(before))
         for share in self._pattern:
-            z = self.regressors(lanes.z_0, 0.5 * (low + high) + 0.5 * (high - low) * share)
+            z = self.regressors(lanes.z_0, middle + change * share)
             plan = self.constraints.around(lanes.scene, z)
             none &= self.constraints.least(lanes.scene, plan.slack, plan.extent) < -ROUNDING
         return none
