@@ -1,9 +1,8 @@
 """Simulate a robot by a model set made from its own log (docs/your_robot.md).
 
-A robot may exist only in a log: nobody wrote a simulator of it. Its model set of mode one-step predicts one control
-period (docs/method.md §13). Rolled out with random errors, this is a simulator that moves about as the robot does,
-behind exactly the sets that the filter will use on the robot. A policy that learns in it learns how much room these
-sets need.
+For some robots there is a log, but no simulator. The model set of mode one-step predicts one control period
+(docs/method.md §13). This simulator repeats the prediction with random errors, so it moves about as the robot does. The
+filter uses the same sets here and on the robot, so a policy learns how much room these sets need.
 
 It proves nothing about the robot: it is wrong wherever the predictor is. Judge a policy on the robot.
 """
@@ -25,12 +24,12 @@ from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 
 SAMPLES = 5  # of the position in a period
-TRIED_ERROR = 0.05  # standard deviation of an error, as a share of the half-width of the set after one period
-# The same. In two first flights, of an ArduCopter and a PX4, it was 0.11 to 0.25, by coordinate. A policy that learned
+# Standard deviation of an error in the trials, and at most, as a share of the half-width of the set after one period.
+# In the first flights of an ArduCopter and a PX4, the shares were 0.11 to 0.25, by coordinate. A policy that learned
 # with 0.25 flew worse than one with 0.15 (docs/your_px4.md).
-LARGEST_ERROR = 0.15
-MOST_ERROR = 0.95  # of that half-width
-TRIALS = 500  # stops by which the size of the errors is chosen
+TRIED_ERROR, LARGEST_ERROR = 0.05, 0.15
+CUT = 0.95  # largest single error, as a share of the same half-width
+TRIALS = 500  # simulated stops, which decide how large the errors are
 
 
 class LearnedMotion:
@@ -38,9 +37,9 @@ class LearnedMotion:
 
     Attributes:
         model: the model set, of mode one-step. robot: its robot.
-        error_share: standard deviation of an error, as a share of the half-width of the set after one period. It is as
-            large as possible, so that errors add up to no more than the sets of a plan: a set that the robot left
-            would say nothing about the robot. Of `TRIALS` stops from inputs at random, 99 % stay in all their sets.
+        error_share: standard deviation of an error, as a share of the half-width of the set after one period. It is
+            the largest one, up to LARGEST_ERROR, with which 99 % of `TRIALS` stops from random inputs stay in all
+            their sets. With larger errors, the simulated robot would leave sets that the real one stays in.
     """
 
     def __init__(self, model: ModelSet) -> None:
@@ -54,7 +53,7 @@ class LearnedMotion:
         """Return the states (T, n) after a period, and the changes (T, n): of the pose in the frame of its start.
 
         Args:
-            state: (T, n). before, input (T, m): inputs of the period before, and of this one.
+            state: (T, n). before, input (T, m): the inputs of the period before and of this one.
             errors (T, n): as shares of the half-widths of the set after one period.
         """
         robot, n, d = self.robot, self.robot.state_dim, self.robot.position_dim
@@ -78,7 +77,7 @@ class LearnedMotion:
 
     def errors(self, rng: np.random.Generator, share: float, count: int = 1) -> Array:
         """Return random errors (count, n) for `after_one_period`."""
-        return np.clip(share * rng.standard_normal((count, self.robot.state_dim)), -MOST_ERROR, MOST_ERROR)
+        return np.clip(share * rng.standard_normal((count, self.robot.state_dim)), -CUT, CUT)
 
     def _share_used(self) -> float:
         """Return the share of a plan's sets of positions that errors of TRIED_ERROR use: 99 % of stops use less."""
@@ -148,7 +147,7 @@ def simulated(conditions: Conditions, tap: object = None, *, robot: Robot) -> Ma
     Raises:
         BadModel: there is none.
         Mismatch: it is about another robot.
-        ValueError: the conditions have something that such a vehicle has not.
+        ValueError: a condition is not simulated here.
     """
     conditions.check("learned")
     path = model_path(robot, ModelConfig(mode=ONE_STEP))
