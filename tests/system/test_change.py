@@ -19,7 +19,7 @@ from tests.system.runs import Run, brakeline
 from tests.waiting import PATIENCE, until
 
 DRIVEN = 1000  # steps of both actors
-BEFORE, AFTER = 120, 250
+BEFORE, AFTER = 120, 1000
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
@@ -66,17 +66,20 @@ def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(d
         processes = run.watch().processes
         certifier = until(lambda: processes.get("certify.adapt"), "the certifier")
         until(lambda: certifier.figures.get("published ground"), "a new model set", 3.0 * PATIENCE)
+        until(lambda: "after the change" in certifier.notes.get("adaptation ground", ""), "its note")
+        note = certifier.notes["adaptation ground"]  # once it plans another set, its note says so
         run.until_steps(AFTER)
-        note, refused = certifier.notes["adaptation ground"], certifier.figures.get("refused ground", 0)
+        refused = certifier.figures.get("refused ground", 0)
         figures = run.end(signal.SIGINT)
     version, why = note.split(" ", 1)
     assert "minutes after the change" in why and refused <= 1
     assert figures["collisions"] == 0 and "certify.adapt" not in figures["restarts"]
     records = list(open_log(run.folder))
     models = [record.message for record in records if record.topic == "model"]
-    assert [model.version for model in models] == [version] and models[0].signature
+    published = [model.version for model in models]
+    assert published[0] == version and all(model.signature for model in models), "a later one may follow"
     exchanges = [record.message for record in records if isinstance(record.message, pb.Exchange)]
-    old = [e for e in exchanges if e.request.widening > 1.3 and e.reply.decision.model != version]
-    new = [e for e in exchanges if e.reply.decision.model == version]
-    assert len(new) > 200 and max(e.request.widening for e in new[-100:]) < max(e.request.widening for e in old)
+    old = [e for e in exchanges if e.request.widening > 1.3 and e.reply.decision.model not in published]
+    new = [e for e in exchanges if e.reply.decision.model in published]
+    assert len(new) > 900 and max(e.request.widening for e in new[-100:]) < max(e.request.widening for e in old)
     assert beyond(new) < 0.02 < beyond(old), "the new set knows the payload"
