@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from brakeline.safety.model.model_set import ModelConfig, ModelSet
     from brakeline.safety.model.validation import ValidationReport, validate
     from brakeline.safety.perception.image_memory import filled, memory_of
+    from brakeline.safety.rivals.own_code import OwnFilter
     from brakeline.safety.service.client import SafetyClient
     from brakeline.safety.service.filter_client import Answer, FilterClient
     from brakeline.safety.service.fleet_client import FleetClient
@@ -88,6 +89,7 @@ PLACES = {
     "brakeline.safety.model.model_set": ("ModelConfig", "ModelSet"),
     "brakeline.safety.model.validation": ("ValidationReport", "validate"),
     "brakeline.safety.perception.image_memory": ("filled", "memory_of"),
+    "brakeline.safety.rivals.own_code": ("OwnFilter",),
     "brakeline.safety.service.client": ("SafetyClient",),
     "brakeline.safety.service.filter_client": ("Answer", "FilterClient"),
     "brakeline.safety.service.fleet_client": ("FleetClient",),
@@ -100,10 +102,10 @@ __all__ = [
     "ActionMapping", "Answer", "BackupPlan", "BadData", "BadDescription", "BadModel", "BadRequest", "BadScan",
     "BadShape", "BusError", "BusSettings", "Dataset", "Decision", "DecisionArrays", "Disc", "ErrorBoundError",
     "Filter", "FilterClient", "FleetClient", "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion",
-    "NoReply", "Obstacle", "ObstacleArrays", "PastArrays", "Prediction", "PredictionArrays", "RangeImage",
-    "RecordedClient", "Refused", "Request", "RequestArrays", "Robot", "RobotWithTask", "SafetyClient", "SafetyError",
-    "SafetyWrapper", "Scan", "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport",
-    "__version__", "certify", "collect", "filled", "fit_model_set", "memory_of", "normalised",
+    "NoReply", "Obstacle", "ObstacleArrays", "OwnFilter", "PastArrays", "Prediction", "PredictionArrays",
+    "RangeImage", "RecordedClient", "Refused", "Request", "RequestArrays", "Robot", "RobotWithTask", "SafetyClient",
+    "SafetyError", "SafetyWrapper", "Scan", "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable",
+    "ValidationReport", "__version__", "certify", "collect", "filled", "fit_model_set", "memory_of", "normalised",
     "robot_from_description", "robot_named", "robot_with_task", "validate",
 ]
 # fmt: on

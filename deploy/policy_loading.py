@@ -14,7 +14,7 @@ from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.errors import BadInput, BadWeights, NoSource, UnknownTask
 from brakeline.messaging.policy_weights import MLP, POLICY
 from brakeline.messaging.task import RobotWithTask
-from brakeline.messaging.task_code import load_code
+from brakeline.messaging.task_code import is_own_code, load_code
 from brakeline.sim.scripted_policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
@@ -43,11 +43,6 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
     if name.endswith(".csv"):
         return replayed(Path(name), robot)
     return driving(network_named(name, robot, seed))
-
-
-def is_own_code(name: str) -> bool:
-    """Return whether a policy's name is a place in a Python file: `FILE.py:CLASS`."""
-    return ".py:" in name
 
 
 def _own_policy(place: str, robot: RobotWithTask, generator: np.random.Generator) -> Policy:

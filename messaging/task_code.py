@@ -33,6 +33,11 @@ FORMER_PLACES = {
 }
 
 
+def is_own_code(name: str) -> bool:
+    """Return whether the name of a policy or a method is a place in a Python file: `FILE.py:CLASS`."""
+    return ".py:" in name
+
+
 def load_code(place: str, folder: Path) -> Any:
     """Import the object at `module:name`, or at `file.py:name` in the folder of the task's file.
 

@@ -16,6 +16,7 @@ from brakeline.safety.filter.request import Decision, Request
 from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.tensor_file import has_entry
+from brakeline.safety.rivals.own_code import OwnCode
 from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
 
 Model = ModelSet | Pretrained
@@ -62,6 +63,8 @@ def ready(model: Model) -> Method:
         from brakeline.safety.filter.filter import Filter
 
         return Filter(model)
+    if isinstance(model, OwnCode):
+        return model.ready()
     if model.method not in RIVALS:
         raise BadModel(f"no method is called {model.method!r}; there are: {', '.join(METHODS)}")
     velocities = model.method == CBF and barrier_of_velocities(model.robot)

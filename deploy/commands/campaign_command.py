@@ -135,8 +135,9 @@ class CampaignCommand:
         """Check the names of a cell, make the model set that it needs, and note the versions of all files."""
         from brakeline.deploy.data.model_store import method_for
         from brakeline.deploy.experiments.experiment_jobs import task_hash
-        from brakeline.deploy.policy_loading import is_own_code, policy_hash, policy_named
+        from brakeline.deploy.policy_loading import policy_hash, policy_named
         from brakeline.messaging.task import arena_kind
+        from brakeline.messaging.task_code import is_own_code
 
         arena_kind(robot, cell.arena)
         if cell.policy.endswith(".csv"):

@@ -136,6 +136,15 @@ class ServiceOptions(FilterOptions):
 
 
 @dataclass(frozen=True)
+class EvaluatedFilter(ServiceOptions):
+    """Choose the filter that checks what the policy proposes: also one of your own."""
+
+    method: Method | str = "ddpc"  # type: ignore[assignment]  # wider than a service's: the code runs in this process
+    """Filter with this method: ddpc (this project's own), a rival or FILE.py:CLASS for a class of your own (see
+    docs/rivals.md), or none for no filter."""
+
+
+@dataclass(frozen=True)
 class PhysicsOptions:
     """Set how the simulated robot differs from the robot that was recorded."""
 

@@ -13,7 +13,7 @@ from rich.markdown import Markdown
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
-from brakeline.deploy.experiments.compared_methods import METHODS, SAC_LEARNER
+from brakeline.deploy.experiments.compared_methods import SAC_LEARNER, compared
 from brakeline.deploy.experiments.comparison_cells import (
     RESULTS,
     RUNS,
@@ -60,7 +60,8 @@ class CompareCommand:
     arenas: tuple[str, ...] = CellConfig.arenas
     """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas."""
     methods: tuple[str, ...] | None = None
-    """Compare these methods. Defaults to all that the robot and the arenas allow."""
+    """Compare these methods. Defaults to all that the robot and the arenas allow. FILE.py:CLASS is a filter of your own
+    (see docs/rivals.md): give another --results folder with it."""
     backend: Literal["single", "batch"] | None = None
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""
@@ -154,20 +155,20 @@ class CompareCommand:
         from brakeline.deploy.data.model_store import method_for
         from brakeline.deploy.experiments.stored_cells import check_addable
         from brakeline.messaging.task import robot_with_task
+        from brakeline.messaging.task_code import is_own_code
         from brakeline.safety.model.model_config import DDPC, ModelConfig
 
         robot, filters = robot_with_task(cells[0].robot), set().union(*(cell.filters() for cell in cells))
         versions = {method: method_for(robot, method, ModelConfig()).version for method in sorted(filters)}
         noted = [replace(one, model_set=versions[DDPC]) if one.task and DDPC in one.filters() else one for one in cells]
+        noted = [replace(one, code=versions[one.method]) if is_own_code(one.method) else one for one in noted]
         if not self.quick:
             check_addable(results, noted)
         return noted
 
     def _methods(self, robot: str) -> tuple[str, ...]:
         methods = compared_on(robot, self.arenas) if self.methods is None else self.methods
-        if unknown := [name for name in methods if name not in METHODS]:
-            raise ValueError(f"no method is called {unknown[0]!r}; there are: {', '.join(METHODS)}")
-        if any(METHODS[name].learner == SAC_LEARNER for name in methods):
+        if any(compared(name).learner == SAC_LEARNER for name in methods):
             import_module("stable_baselines3")  # a missing extra is told before hours of other trainings
         return methods
 

@@ -21,11 +21,13 @@ from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import RobotWithTask, needs_task
+from brakeline.messaging.task_code import is_own_code
 from brakeline.safety.methods import METHODS, Model
 from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound
-from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.own_code import OwnCode
+from brakeline.safety.rivals.pretrained import NOT_PRETRAINED, Pretrained
 
 if TYPE_CHECKING:
     from brakeline.deploy.data.rival_pretraining import RivalConfig
@@ -156,7 +158,7 @@ def _shipped(robot: Robot) -> ModelSet | None:
 def method_for(
     robot: Robot, method: str, model_config: ModelConfig, accept_bound: float | None = None, build: bool = True
 ) -> Model:
-    """Return the model that a method needs: a model set for ours, trained networks for a rival.
+    """Return the model that a method needs: a model set for ours, trained networks for a rival, code for your own.
 
     A missing model is built first, unless `build` is False.
 
@@ -167,10 +169,12 @@ def method_for(
     """
     if method == DDPC:
         return model_for(robot, model_config, accept_bound, build)
-    if method not in METHODS:
-        raise ValueError(f"there is no method {method!r}; choose one of {', '.join(METHODS)}")
+    if method not in METHODS and not is_own_code(method):
+        raise ValueError(f"there is no method {method!r}; choose one of {', '.join(METHODS)}, none, or FILE.py:CLASS")
     if robot.late:
         raise ValueError(f"{method} has no real-time mode: its decision is for the period of the request")
+    if is_own_code(method):
+        return OwnCode(robot, method, {}, {}, NOT_PRETRAINED)
     from brakeline.deploy.data.rival_pretraining import config_for
 
     robot = needs_task(robot)

@@ -20,7 +20,7 @@ from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import barrier_of_velocities
 from brakeline.safety.model.model_config import CBF, PSF, SAILR, SECAS
-from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.pretrained import NOT_PRETRAINED, Pretrained
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,7 @@ def pretrain(robot: RobotWithTask, config: RivalConfig, after_step: AfterStep = 
 def _by_hand(robot: RobotWithTask, config: BarrierConfig | VelocityBarrierConfig | PredictiveConfig) -> Pretrained:
     """Return the model of a rival that knows equations by hand: settings alone."""
     settings = asdict(config)
-    about = {"recipe": json.dumps(settings), "samples": "0", "collisions": "0", "seconds": "0"}
-    about |= {"error": "nothing was fitted", VERSION: str(robot.task.simulator_version)}
+    about = NOT_PRETRAINED | {"recipe": json.dumps(settings), VERSION: str(robot.task.simulator_version)}
     return Pretrained(robot, PSF if isinstance(config, PredictiveConfig) else CBF, {}, settings, about)
 
 

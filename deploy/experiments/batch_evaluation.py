@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 from brakeline.actors.episode_runner import EPISODE_STRIDE
 from brakeline.deploy.batch_robots import BatchRobots
 from brakeline.deploy.data.model_store import method_for
-from brakeline.deploy.policy_loading import is_own_code, network_named
+from brakeline.deploy.policy_loading import network_named
 from brakeline.errors import NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.task_code import is_own_code
 from brakeline.safety.filter.batch.row_by_row import BatchMethod, RowByRow
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.methods import Model, ready

@@ -15,7 +15,7 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.batch_evaluation import batch_method, drive_episodes
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
+from brakeline.deploy.experiments.compared_methods import NONE, SAC_LEARNER, compared
 from brakeline.deploy.experiments.comparison_cells import (
     LEARNING,
     TIMED,
@@ -70,13 +70,15 @@ class CellRun:
         self.models = {method: method_for(self.robot, method, cell.model_config) for method in cell.filters()}
         if cell.model_set and self.models[DDPC].version != cell.model_set:
             raise ResultError(f"the model set of {cell.robot} is no longer {cell.model_set}: run the comparison again")
+        if cell.code and self.models[cell.method].version != cell.code:
+            raise ResultError(f"{cell.method} has changed since the comparison began: run it again")
 
     def result(self) -> dict[str, Any]:
         """Train and evaluate, and return the content of the cell's file."""
         self.folder.mkdir(parents=True, exist_ok=True)
         training = self._train()
         evaluations = {trial.name: self._evaluate(trial) for trial in self.cell.trials()}
-        model = self.models.get(METHODS[self.cell.method].filter)
+        model = self.models.get(compared(self.cell.method).filter)
         return {
             "study": configuration(self.cell),
             "model": None if model is None else {"version": model.version, **_cost(model, self.robot)},
@@ -88,9 +90,9 @@ class CellRun:
 
     def _train(self) -> dict[str, Any]:
         cell, table = self.cell, EpisodeTable()
-        trial = TrialConfig(LEARNING, METHODS[cell.method].filter, cell.arenas[0], 0)
+        trial = TrialConfig(LEARNING, compared(cell.method).filter, cell.arenas[0], 0)
         train = self._train_batch if cell.backend == "batch" else self._train_single
-        if METHODS[cell.method].learner == SAC_LEARNER:
+        if compared(cell.method).learner == SAC_LEARNER:
             train = self._train_sac
         with self._log("training", trial) as log:
 

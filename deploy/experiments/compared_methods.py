@@ -1,11 +1,15 @@
-"""THE table of the methods that the comparison trains: a learner, and the filter in front of the robot."""
+"""THE table of the methods that the comparison trains: a learner, and the filter in front of the robot.
+
+A filter of your own (`FILE.py:CLASS`) is a method too; its learner is TD3.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from brakeline.messaging.task_code import is_own_code
 from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
 
 NONE = "none"
@@ -84,3 +88,22 @@ METHODS: dict[str, ComparedMethod] = {
         robots=BATCHES,
     ),
 }
+
+
+def compared(name: str) -> ComparedMethod:
+    """Return the method of this name. Raises ValueError: there is none."""
+    if is_own_code(name):
+        return ComparedMethod(short_name(name), name, MAP, "code of its own", NOTHING)
+    if name not in METHODS:
+        raise ValueError(f"no method is called {name!r}; there are: {', '.join(METHODS)}, or FILE.py:CLASS")
+    return METHODS[name]
+
+
+def short_name(method: str) -> str:
+    """Return a method's name in the names of files: of code of your own, the class."""
+    return method.rpartition(":")[2]
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Return each of these methods once: in the order of the table, then those of your own."""
+    return sorted(set(methods), key=lambda name: ([*METHODS, name].index(name), name))

@@ -18,7 +18,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, TD3_LEARNER
+from brakeline.deploy.experiments.compared_methods import (
+    BATCHES,
+    EVERY,
+    METHODS,
+    NONE,
+    TD3_LEARNER,
+    compared,
+    short_name,
+)
 from brakeline.deploy.experiments.experiment_jobs import task_hash
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
@@ -49,7 +57,7 @@ class TrialConfig:
     @property
     def name(self) -> str:
         """The name of its log, and of its figures in the cell's file."""
-        return f"{self.policy}-{self.method}-{self.arena}"
+        return f"{self.policy}-{short_name(self.method)}-{self.arena}"
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,7 @@ class CellConfig:
     """The configuration of a cell. With the version of the code, it determines the results."""
 
     robot: str  # ROBOT, or ROBOT+TASK for another task than the default: ground+tracks
-    method: str  # of `METHODS`
+    method: str  # of `compared_methods`
     seed: int
     steps: int
     episodes: int
@@ -72,6 +80,7 @@ class CellConfig:
     task: str = ""  # see `experiment_jobs.task_hash`
     # Version of the model set that filters a robot of your own. Empty: no trial needs one, or the robot is ours.
     model_set: str = ""
+    code: str = ""  # version of a filter of your own (`OwnCode`); empty: no such filter
 
     def __post_init__(self) -> None:
         from brakeline.messaging.task import check_penalty
@@ -80,12 +89,12 @@ class CellConfig:
 
     @property
     def name(self) -> str:
-        return f"{self.method}-s{self.seed}"
+        return f"{short_name(self.method)}-s{self.seed}"
 
     def trials(self) -> list[TrialConfig]:
         """Return the evaluations for the table, then those that add or remove the filter after training."""
         first = self.arenas[0]
-        table = [TrialConfig(TRAINED, METHODS[self.method].filter, arena, self.episodes) for arena in self.arenas]
+        table = [TrialConfig(TRAINED, compared(self.method).filter, arena, self.episodes) for arena in self.arenas]
         if self.method == DDPC:
             table.append(TrialConfig(TRAINED, NONE, first, self.episodes))
             table.append(TrialConfig(UNTRAINED, DDPC, first, self.untrained))
@@ -95,7 +104,7 @@ class CellConfig:
 
     def filters(self) -> set[str]:
         """Return the methods that filter in the training and in the evaluations."""
-        return {METHODS[self.method].filter, *(trial.method for trial in self.trials())} - {NONE}
+        return {compared(self.method).filter, *(trial.method for trial in self.trials())} - {NONE}
 
     def run(self, folder: Path, say: Report = lambda text: None) -> dict[str, Any]:
         """Train, evaluate, and check the figures against the logs. Logs and policy stay in `folder`.
@@ -131,9 +140,9 @@ def learning(td3: TD3Config, method: str, settings: Mapping[str, Any]) -> TD3Con
     A batch keeps an update for each step. With an update for every fourth one, as `train --backend batch` makes, TD3
     without a filter stood still after 60,000 steps (seed 0); with one for each it reached 493 of 500 goals.
     """
-    compared = METHODS[method]
-    with_task = compared.filter not in (NONE, SAILR) and compared.learner == TD3_LEARNER
-    return td3.with_settings({**(settings if with_task else {}), **compared.td3})
+    row = compared(method)
+    with_task = row.filter not in (NONE, SAILR) and row.learner == TD3_LEARNER
+    return td3.with_settings({**(settings if with_task else {}), **row.td3})
 
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
@@ -163,7 +172,7 @@ def cell_configs(
     others["task"] = task_hash(robot)
     seeds = range(SEEDS[backend]) if seeds is None else seeds
     penalties = {
-        name: 1.0 if METHODS[name].filter in TUNED_AT_1 else task.reward.correction_penalty for name in methods
+        name: 1.0 if compared(name).filter in TUNED_AT_1 else task.reward.correction_penalty for name in methods
     }
     return [
         CellConfig(robot, method, seed, task.steps, EPISODES, arenas, penalty=penalties[method], **others)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate
-from brakeline.deploy.experiments.compared_methods import METHODS
-from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW, spans
+from brakeline.deploy.experiments.compared_methods import compared, in_order
+from brakeline.deploy.experiments.comparison_table import WINDOW, spans
 from brakeline.logs.run_groups import METHOD_COLORS, performance_profile
 from brakeline.messaging.robot import Array
 
 POINTS = 200  # per curve
+OWN_COLORS = ("#8c564b", "#7f7f7f", "#17becf")  # of filters of your own
 
 
 def _save(picture: Figure, png: Path) -> None:
@@ -60,16 +62,13 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
     rows = [("goal", "goals reached"), ("collision", "collisions so far"), ("reward", "reward of an episode")]
     rows.append(("interventions", "share of steps with an intervention"))
     panels: list[Axes] = list(picture.subplots(2, 2, sharex=True).ravel())
-    steps = results[0]["study"]["steps"]
+    steps, colors = results[0]["study"]["steps"], _colors(result["study"]["method"] for result in results)
     grid = np.linspace(0.0, steps, POINTS)
     for axes, (name, label) in zip(panels, rows, strict=True):
-        for method in METHODS:
-            own = [result for result in results if result["study"]["method"] == method]
-            if not own:
-                continue
-            lines = _lines(own, name, grid)
-            axes.plot(grid, lines.T, color=METHOD_COLORS[method], alpha=0.3, linewidth=0.8)
-            axes.plot(grid, lines.mean(axis=0), color=METHOD_COLORS[method], linewidth=2.0, label=NAMES[method])
+        for method, color in colors.items():
+            lines = _lines([result for result in results if result["study"]["method"] == method], name, grid)
+            axes.plot(grid, lines.T, color=color, alpha=0.3, linewidth=0.8)
+            axes.plot(grid, lines.mean(axis=0), color=color, linewidth=2.0, label=compared(method).label)
         axes.set_title(label, fontsize=10)
         axes.grid(alpha=0.3)
         axes.margins(x=0.01)
@@ -88,9 +87,9 @@ def profiles(goals: Mapping[str, Array], png: Path) -> None:
     """
     picture = Figure(figsize=(7.0, 4.5), layout="constrained")
     axes: Axes = picture.subplots()
-    for method, scores in goals.items():
-        profile, color = performance_profile(scores), METHOD_COLORS[method]
-        axes.plot(profile["level"], profile["share"], color=color, label=NAMES[method])
+    for method, color in _colors(goals).items():
+        profile = performance_profile(goals[method])
+        axes.plot(profile["level"], profile["share"], color=color, label=compared(method).label)
         if "low" in profile:
             axes.fill_between(profile["level"], profile["low"], profile["high"], color=color, alpha=0.15, linewidth=0.0)
     axes.set_xlabel("share of goals in an evaluation")
@@ -105,7 +104,7 @@ def seeds_as_points(table: dict[str, Any], png: Path) -> None:
     """Plot goal and collision rates of each part: the interval as a line, each seed as a point."""
     parts = [part for part in table["parts"] if part != "deployment"]
     picture = Figure(figsize=(3.4 * len(parts), 5.6), layout="constrained")
-    grid = picture.subplots(2, len(parts), squeeze=False)
+    grid, colors = picture.subplots(2, len(parts), squeeze=False), _colors(table["seeds"])
     for column, part in enumerate(parts):
         for row, name in enumerate(("goal rate", "collision rate")):
             axes: Axes = grid[row][column]
@@ -114,8 +113,8 @@ def seeds_as_points(table: dict[str, Any], png: Path) -> None:
                 axes.set_axis_off()
                 continue
             for place, (method, estimate) in enumerate(methods.items()):
-                _point(axes, place, estimate, METHOD_COLORS[method])
-            axes.set_xticks(range(len(methods)), [NAMES[m] for m in methods])
+                _point(axes, place, estimate, colors[method])
+            axes.set_xticks(range(len(methods)), [compared(m).label for m in methods])
             axes.set_title(f"{part}: {name} [%]", fontsize=10)
             axes.grid(axis="y", alpha=0.3)
             axes.set_xlim(-0.6, len(methods) - 0.4)
@@ -124,6 +123,12 @@ def seeds_as_points(table: dict[str, Any], png: Path) -> None:
             else:
                 axes.set_ylim(bottom=-0.5)
     _save(picture, png)
+
+
+def _colors(methods: Iterable[str]) -> dict[str, str]:
+    """Return the color of each of these methods, in the order of the tables."""
+    others = itertools.cycle(OWN_COLORS)
+    return {method: METHOD_COLORS.get(method) or next(others) for method in in_order(methods)}
 
 
 def _point(axes: Axes, place: int, estimate: MeanEstimate, colour: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order, short_name
 from brakeline.deploy.experiments.episode_table import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.messaging.robot import Array
@@ -25,7 +25,6 @@ from brakeline.safety.model.model_config import DDPC
 Result = dict[str, Any]
 Row = dict[str, Any]
 
-NAMES = {name: method.label for name, method in METHODS.items()}
 PAPER = Path(__file__).with_name("paper.json")
 WINDOW = 50  # training episodes per goal rate
 LEARNED = 0.9  # the goal rate that counts as learned
@@ -75,6 +74,11 @@ def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:
     reached = np.where(np.array(episodes["goal"], bool), spans(episodes)[1], np.inf)
     windows = np.sort(np.lib.stride_tricks.sliding_window_view(reached, WINDOW), axis=1)
     return float(min(windows[:, math.ceil(LEARNED * WINDOW) - 1].min(), steps))
+
+
+def evaluation_name(method: str, arena: str) -> str:
+    """Return the name of the evaluation of a method's policies behind its own filter, as `TrialConfig.name` has it."""
+    return f"{TRAINED}-{short_name(compared(method).filter)}-{arena}"
 
 
 def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
@@ -140,7 +144,8 @@ def table(results: Iterable[Result]) -> dict[str, Any]:
         ValueError: the results belong to several robots.
     """
     cells = sorted(results, key=lambda cell: int(cell["study"]["seed"]))
-    groups = {m: group for m in METHODS if (group := [c for c in cells if c["study"]["method"] == m])}
+    order = in_order(cell["study"]["method"] for cell in cells)
+    groups = {m: [cell for cell in cells if cell["study"]["method"] == m] for m in order}
     seeds = {m: [c["study"]["seed"] for c in group] for m, group in groups.items()}
     robots = {c["study"]["robot"] for c in cells}
     if len(robots) != 1:
@@ -148,7 +153,7 @@ def table(results: Iterable[Result]) -> dict[str, Any]:
     study = cells[0]["study"]
     parts: dict[str, dict[str, Row]] = {"training": {m: training_rows(group) for m, group in groups.items()}}
     for arena in study["arenas"]:
-        parts[arena] = {m: evaluation_rows(g, f"{TRAINED}-{METHODS[m].filter}-{arena}") for m, g in groups.items()}
+        parts[arena] = {m: evaluation_rows(g, evaluation_name(m, arena)) for m, g in groups.items()}
     parts["deployment"] = _deployment(groups, study["arenas"][0])
     about = {"robot": study["robot"], "seeds": seeds, "versions": cells_by_version(cells)}
     return about | {"steps": study["steps"], "episodes": study["episodes"], "parts": parts}
@@ -270,6 +275,6 @@ def markdown(figures: dict[str, Any]) -> str:
             beside = [_paper(robot, row, method) for method in methods]
             if part not in ("training", "deployment") and any(beside):
                 rows.append(["*paper*", *(f"*{text}*" if text else "" for text in beside)])
-        heads = [f"{NAMES[m]}, n = {counts[m]}" if m in counts else m for m in methods]
+        heads = [f"{compared(m).label}, n = {counts[m]}" if m in counts else m for m in methods]
         lines += [f"## {part}", "", *markdown_table(["", *heads], rows), ""]
     return "\n".join(lines)

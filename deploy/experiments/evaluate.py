@@ -17,6 +17,7 @@ from brakeline.deploy.experiments.task_engine import Engine, Say, unsaid
 from brakeline.deploy.policy_loading import file_named, policy_named
 from brakeline.deploy.run.run_config import SEEDS
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import BadModel
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.log_analysis import perception_in
 from brakeline.messaging import brakeline_pb2 as pb
@@ -24,6 +25,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import Model
 from brakeline.safety.model.model_config import DDPC, check_reservations
 from brakeline.safety.model.model_set import ModelConfig
+from brakeline.safety.rivals.own_code import OwnCode
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.shared_world import FleetEnv
@@ -128,7 +130,22 @@ def prepare_fleet(
 def _ask_for(robot: RobotWithTask, evaluation: Evaluation) -> Ask | None:
     """Return the function that asks the filter, or None for the method `none`."""
     model = _model_for(robot, evaluation)
-    return None if model is None else in_process(model, evaluation.accept_bound)
+    if model is None:
+        return None
+    ask = in_process(model, evaluation.accept_bound)
+    return _raising(ask, evaluation.method) if isinstance(model, OwnCode) else ask
+
+
+def _raising(ask: Ask, method: str) -> Ask:
+    """Return a function that raises BadModel if a filter of your own fails. A service would reply with the error."""
+
+    def raising(requests: Sequence[pb.Request]) -> list[pb.Reply]:
+        replies = ask(requests)
+        if failed := [reply.error for reply in replies if reply.HasField("error")]:
+            raise BadModel(f"{method} failed: {failed[0].type}: {failed[0].message}")
+        return replies
+
+    return raising
 
 
 def _model_for(robot: RobotWithTask, evaluation: Evaluation) -> Model | None:

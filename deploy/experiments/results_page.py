@@ -13,12 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER, ComparedMethod
-from brakeline.deploy.experiments.comparison_table import cells_by_version, markdown_table, steps_to_learn, version_note
+from brakeline.deploy.experiments.compared_methods import NONE, SAC_LEARNER, ComparedMethod, compared
+from brakeline.deploy.experiments.comparison_table import (
+    cells_by_version,
+    evaluation_name,
+    markdown_table,
+    steps_to_learn,
+    version_note,
+)
 from brakeline.deploy.experiments.experiment_jobs import stored_result
 from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
-from brakeline.deploy.policy_loading import TRAINED
 from brakeline.learner.learner_config import TD3Config
 from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.logs.run_groups import aggregate, probability_of_improvement
@@ -45,8 +50,7 @@ class RobotResults:
             self.cells.setdefault(cell["study"]["method"], []).append(cell)
 
     def evaluations(self, method: str, arena: str) -> list[Result]:
-        name = f"{TRAINED}-{METHODS[method].filter}-{arena}"
-        return [cell["evaluations"][name] for cell in self.cells[method]]
+        return [cell["evaluations"][evaluation_name(method, arena)] for cell in self.cells[method]]
 
     def goals(self, method: str, arenas: Sequence[str] | None = None) -> Array:
         """Return the share of goals (arenas, runs)."""
@@ -145,8 +149,8 @@ def _own_settings(robot: RobotWithTask, robot_results: RobotResults) -> list[tup
     """Return the settings in which the learners of the methods may differ, a row for each set of them."""
     methods: dict[str, list[str]] = {}
     for name, cells in robot_results.cells.items():
-        text = ", ".join(_settings_of(METHODS[name], cells[0]["study"], robot.task.symmetry != "none"))
-        methods.setdefault(text, []).append(METHODS[name].label)
+        text = ", ".join(_settings_of(compared(name), cells[0]["study"], robot.task.symmetry != "none"))
+        methods.setdefault(text, []).append(compared(name).label)
     return [(f"learner of {'; '.join(labels)}", text) for text, labels in methods.items()]
 
 
@@ -180,7 +184,7 @@ def _methods(robot_results: RobotResults) -> str:
     heads = ["method", "n", "learner", "obstacles for the filter", "the filter's model", "recorded periods", "source"]
     rows = []
     for name, cells in robot_results.cells.items():
-        method, model = METHODS[name], cells[0]["model"]
+        method, model = compared(name), cells[0]["model"]
         samples = "0" if model is None else f"{int(model['samples']):,}"
         if model is not None and int(model["collisions"]):
             samples += f", with {int(model['collisions']):,} collisions"
@@ -198,14 +202,14 @@ def _main(robot_results: RobotResults) -> list[str]:
     rows = []
     for method, cells in robot_results.cells.items():
         scores = [_iqm(aggregate(robot_results.goals(method, [arena])[0])) for arena in robot_results.arenas]
-        rows.append([METHODS[method].label, str(len(cells)), *scores, _iqm(aggregate(robot_results.goals(method)))])
+        rows.append([compared(method).label, str(len(cells)), *scores, _iqm(aggregate(robot_results.goals(method)))])
     lines += [*markdown_table(heads, rows), ""]
     heads = ["method", *(f"collisions, `{arena}`" for arena in robot_results.arenas), "collisions in a training"]
     rows = []
     for method in robot_results.cells:
         counts = [_share(*robot_results.collisions(method, arena)) for arena in robot_results.arenas]
         trained = robot_results.training_collisions(method)
-        rows.append([METHODS[method].label, *counts, f"{np.mean(trained):.1f} ({min(trained)} to {max(trained)})"])
+        rows.append([compared(method).label, *counts, f"{np.mean(trained):.1f} ({min(trained)} to {max(trained)})"])
     lines += [*markdown_table(heads, rows), ""]
     heads = ["method", "steps to 90 % of goals", "runs that got there"]
     heads += [f"interventions, `{arena}`" for arena in robot_results.arenas]
@@ -218,7 +222,7 @@ def _main(robot_results: RobotResults) -> list[str]:
         times = [f"{robot_results.decision_ms(method, arena):.2f}" for arena in robot_results.arenas]
         figures = aggregate(learned)
         speed = f"{figures['iqm']:,.0f}" + _interval(figures["iqm_interval"], ",.0f")
-        rows.append([METHODS[method].label, speed, f"{reached} of {len(cells)}", *shares, *times])
+        rows.append([compared(method).label, speed, f"{reached} of {len(cells)}", *shares, *times])
     return [*lines, *markdown_table(heads, rows), ""]
 
 
@@ -249,7 +253,7 @@ def _improvements(robot_results: RobotResults) -> list[str]:
         if method != DDPC:
             row = probability_of_improvement(robot_results.goals(DDPC), robot_results.goals(method))
             probability = f"{row['probability']:.2f}" + _interval(row["interval"], ".2f")
-            rows.append([f"ours over {METHODS[method].label}", probability])
+            rows.append([f"ours over {compared(method).label}", probability])
     return [*markdown_table(["", "probability"], rows), ""]
 
 
@@ -269,7 +273,7 @@ def _tuning(results: Path, robot: RobotWithTask, robot_results: RobotResults) ->
         used = value_in_use(robot_results.cells[users[0]][0], robot.footprint) if users else None
         figures = [_tried(row) for row in values]
         chosen = f"{best:g}", "–" if used is None else f"{used:g}"
-        rows.append([METHODS[method].label, METHODS[method].tuned, *figures, *chosen])
+        rows.append([compared(method).label, compared(method).tuned, *figures, *chosen])
     most = max(map(len, tried.values()))
     heads = ["method", "setting", *(f"value {i + 1}" for i in range(most)), "best", "in use"]
     padded = [[*row[:-2], *[""] * (len(heads) - len(row)), *row[-2:]] for row in rows]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order
 from brakeline.deploy.experiments.comparison_cells import CellConfig
 from brakeline.deploy.experiments.experiment_jobs import configuration, stored_result
 from brakeline.deploy.experiments.task_engine import robot_folder
@@ -28,11 +28,12 @@ def stored_cells(results: Path, robot: str) -> list[dict[str, Any]]:
     Raises:
         ResultError: a file is damaged, or cells differ in more than the method and its settings.
     """
-    folder, order = robot_folder(results, robot), list(METHODS)
+    folder = robot_folder(results, robot)
     cells = [stored_result(path) for path in _paths(folder)]
+    order = in_order(cell["study"]["method"] for cell in cells)
     cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
     _check_comparable([cell["study"] for cell in cells], folder)
-    for method in METHODS:
+    for method in order:
         models = [cell["model"] or {} for cell in cells if cell["study"]["method"] == method]
         if len({json.dumps(model.get("settings"), sort_keys=True) for model in models}) > 1:
             raise ResultError(SEVERAL.format(folder=folder, method=method))
@@ -60,13 +61,13 @@ def _check_comparable(studies: Sequence[dict[str, Any]], folder: Path) -> None:
                 "ones away, or give another --results"
             )
     for study in studies:
-        states_set = METHODS[study["method"]].filter == DDPC or study["method"] == NONE
+        states_set = compared(study["method"]).filter == DDPC or study["method"] == NONE
         if study.get("task") and states_set and not study.get("model_set"):
             raise ResultError(
                 f"{folder}: {study['method']}-s{study['seed']} does not state the model set that filtered the robot: "
                 "run it again with --again, or move it away"
             )
-    for method in METHODS:
+    for method in {study["method"] for study in studies}:
         if len({_settings(study) for study in studies if study["method"] == method}) > 1:
             raise ResultError(SEVERAL.format(folder=folder, method=method))
 

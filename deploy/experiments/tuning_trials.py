@@ -27,6 +27,7 @@ from brakeline.deploy.experiments.experiment_jobs import configuration, task_has
 from brakeline.deploy.experiments.trials import fresh_trial
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.messaging.task_code import is_own_code
 from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS, ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
 
@@ -150,6 +151,8 @@ def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> 
     jobs: list[FilterTuning | LearnerTuning] = []
     task = robot_with_task(robot).task
     for method in methods:
+        if is_own_code(method):
+            raise ValueError(f"{method}: the tuning knows settings of the rivals in its table alone, not yours")
         rival = METHODS[method].filter
         if method in SETTINGS:
             name, values = SETTINGS[method]

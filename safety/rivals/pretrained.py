@@ -25,6 +25,7 @@ from brakeline.safety.model.tensor_file import pack, unpack
 
 ENTRY = "pretrained"
 RAYS = "rays"  # the tensor with the directions
+NOT_PRETRAINED = {"samples": "0", "collisions": "0", "seconds": "0", "error": "nothing was fitted"}  # notes
 
 
 @dataclass(frozen=True)
