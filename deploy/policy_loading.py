@@ -76,7 +76,7 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
     """Return the network with this name or file; see `policy_named`."""
     if name == UNTRAINED:
         return MLP.untrained(robot, seed)
-    stored = _stored(robot)
+    stored = stored_policies(robot)
     path = stored.get(name) or _weights(name, robot)
     if path.is_dir():
         raise ValueError(
@@ -96,14 +96,14 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
 
 def file_named(name: str, robot: RobotWithTask) -> Path | None:
     """Return the file of your own that `policy_named` reads; None if a policy has this name, whatever files exist."""
-    if name in robot.task.policies or name == UNTRAINED or name in _stored(robot):
+    if name in robot.task.policies or name == UNTRAINED or name in stored_policies(robot):
         return None
     return _weights(name, robot)
 
 
 def policy_hash(name: str, robot: RobotWithTask) -> str:
     """Return a hash of the file of the policy with this name; empty if none is read (see `policy_named`)."""
-    path = _stored(robot).get(name) or _weights(name, robot)
+    path = stored_policies(robot).get(name) or _weights(name, robot)
     scripted_or_new = name in robot.task.policies or name == UNTRAINED
     return "" if scripted_or_new else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
@@ -116,7 +116,7 @@ def _weights(name: str, robot: RobotWithTask) -> Path:
     return next((file for file in learned if file.is_file()), path)
 
 
-def _stored(robot: RobotWithTask) -> dict[str, Path]:
+def stored_policies(robot: RobotWithTask) -> dict[str, Path]:
     """Return the files of the stored policies by name: in policies/, and beside the task file of your own robot."""
     task = robot.task
     beside = task.folder / f"{TRAINED}.safetensors"

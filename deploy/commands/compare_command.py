@@ -58,7 +58,8 @@ class CompareCommand:
     episodes: int | None = None
     """Evaluate on this many episodes for each seed and arena. Defaults to the number that the comparison uses."""
     arenas: tuple[str, ...] = CellConfig.arenas
-    """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas."""
+    """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas. A robot of
+    your own without an arena of the name dense is evaluated in default alone."""
     methods: tuple[str, ...] | None = None
     """Compare these methods. Defaults to all that the robot and the arenas allow. FILE.py:CLASS is a filter of your own
     (see docs/rivals.md): give another --results folder with it."""
@@ -79,7 +80,7 @@ class CompareCommand:
     again: bool = False
     """Run again what has results already."""
     conservatism: bool = True
-    """Also make the table of error bounds and modes, with the stored policy."""
+    """Also make the table of error bounds and modes, if a policy of the robot is stored."""
     penalty: float | None = None
     """Subtract this penalty from the learner's reward if the filter corrects an input by its whole range. Defaults to
     the one in the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
@@ -118,7 +119,7 @@ class CompareCommand:
             measured.check_recording(results)
         for robot in robots:
             if self.tune:
-                trials = tuning_jobs(robot, self._methods(robot), self.arenas)
+                trials = tuning_jobs(robot, self._methods(robot), self._arenas(robot))
                 complete(trials, results, runs, self.engine, self.again, say)
                 continue
             cells, others = jobs_of.get(robot, ([], []))
@@ -156,18 +157,34 @@ class CompareCommand:
         from brakeline.deploy.experiments.stored_cells import check_addable
         from brakeline.messaging.task import robot_with_task
         from brakeline.messaging.task_code import is_own_code
-        from brakeline.safety.model.model_config import DDPC, ModelConfig
+        from brakeline.safety.model.model_config import DDPC
+        from brakeline.safety.rivals.own_code import OwnCode
 
         robot, filters = robot_with_task(cells[0].robot), set().union(*(cell.filters() for cell in cells))
-        versions = {method: method_for(robot, method, ModelConfig()).version for method in sorted(filters)}
+        models = {method: method_for(robot, method, cells[0].model_config) for method in sorted(filters)}
+        for model in models.values():
+            if isinstance(model, OwnCode):
+                model.ready()  # code that cannot be loaded ends the command before the first training
+        versions = {method: model.version for method, model in models.items()}
         noted = [replace(one, model_set=versions[DDPC]) if one.task and DDPC in one.filters() else one for one in cells]
         noted = [replace(one, code=versions[one.method]) if is_own_code(one.method) else one for one in noted]
         if not self.quick:
             check_addable(results, noted)
         return noted
 
+    def _arenas(self, robot: str) -> tuple[str, ...]:
+        """Return the arenas of a robot's cells. Raises UnknownName: it has no such arena."""
+        from brakeline.messaging.task import arena_kind, robot_with_task
+
+        described = robot_with_task(robot)
+        if self.arenas == CellConfig.arenas:
+            return tuple(arena for arena in self.arenas if arena in described.task.arenas) or self.arenas[:1]
+        for arena in self.arenas:
+            arena_kind(described, arena)
+        return self.arenas
+
     def _methods(self, robot: str) -> tuple[str, ...]:
-        methods = compared_on(robot, self.arenas) if self.methods is None else self.methods
+        methods = compared_on(robot, self._arenas(robot)) if self.methods is None else self.methods
         if any(compared(name).learner == SAC_LEARNER for name in methods):
             import_module("stable_baselines3")  # a missing extra is told before hours of other trainings
         return methods
@@ -175,11 +192,12 @@ class CompareCommand:
     def _jobs(self, robot: str) -> tuple[list[CellConfig], list[Conservatism]]:
         """Return the cells of a robot, and the other jobs."""
         from brakeline.deploy.experiments.conservatism import Conservatism
+        from brakeline.deploy.policy_loading import TRAINED, stored_policies
         from brakeline.messaging.task import check_penalty, robot_with_task
 
         described = robot_with_task(robot)
         check_penalty(self.penalty, described)
-        cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
+        cells = cell_configs(robot, self._methods(robot), self.seeds, self._arenas(robot), self.backend)
         if not cells:
             raise ValueError("nothing to compare: give at least one of --seeds and of --methods")
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
@@ -192,7 +210,7 @@ class CompareCommand:
         settings = described.task.learner if self.task_settings else {}
         own = [replace(cell, td3=learning(self.td3, cell.method, settings)) for cell in cells]
         chosen = [replace(quick(cell) if self.quick else cell, **changed) for cell in own]
-        conservatism = self.conservatism and not self.quick
+        conservatism = self.conservatism and not self.quick and TRAINED in stored_policies(described)
         return chosen, [Conservatism(robot, task=task_hash(robot))] if conservatism else []
 
     def _write(self, cells: Results, others: Results, folder: Path) -> Any:

@@ -30,7 +30,7 @@ from brakeline.deploy.experiments.compared_methods import (
 from brakeline.deploy.experiments.experiment_jobs import task_hash
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
-from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
+from brakeline.safety.model.model_config import AUTO, DDPC, SAILR, SECAS, ModelConfig
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Backend
@@ -169,7 +169,8 @@ def cell_configs(
 
     methods, task, backend = tuple(methods), robot_with_task(robot).task, backend or backend_for(robot, arenas)
     others: dict[str, Any] = {"backend": backend, "robots": task.at_once, "physics": task.simulator_version}
-    others["task"] = task_hash(robot)
+    if own := task_hash(robot):  # its model set is the one in use; the stored cells of the others have mode direct
+        others |= {"task": own, "model_config": ModelConfig(mode=AUTO)}
     seeds = range(SEEDS[backend]) if seeds is None else seeds
     penalties = {
         name: 1.0 if compared(name).filter in TUNED_AT_1 else task.reward.correction_penalty for name in methods

@@ -46,7 +46,7 @@ from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.experiments.tuning_trials import tuning_jobs, values_of
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
-from brakeline.errors import ResultError
+from brakeline.errors import ResultError, UnknownName
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.logs.figure_tables import analyse
@@ -380,6 +380,17 @@ def test_results_of_a_robot_of_ones_own_with_another_task_or_description_are_ref
             with pytest.raises(ResultError, match=r"another .*task"):
                 read_result(tmp_path / file, job)
     assert task_hash("ground") == task_hash("ground+tracks") == "", "shipped robots change with Brakeline only"
+
+
+def test_a_robot_of_ones_own_is_compared_behind_the_model_set_in_use_and_in_the_arenas_that_it_has():
+    """Mode direct was fitted anew, or failed on free driving; and without an arena `dense` the last training failed."""
+    skid = str(Path(__file__).parents[3] / "examples" / "own_log" / "skid.toml")
+    (cell,), others = CompareCommand(methods=("ddpc",), seeds=(0,))._jobs(skid)
+    assert (cell.model_config.mode, cell.arenas, others) == ("auto", ("default",), []), "no policy is stored"
+    (cell,), others = CompareCommand(methods=("ddpc",), seeds=(0,))._jobs("ground")
+    assert (cell.model_config.mode, cell.arenas, len(others)) == ("direct", ("default", "dense"), 1)
+    with pytest.raises(UnknownName, match="no arena is called 'dense'"):
+        CompareCommand(methods=("ddpc",), seeds=(0,), arenas=("dense",))._jobs(skid)
 
 
 def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_path, monkeypatch):

@@ -96,6 +96,8 @@ def test_what_is_no_filter_is_refused_with_the_reason(data_folder: Path, place: 
         make("Quarter")
     with pytest.raises(BadModel, match=r"return 2 finite numbers \(speed"):
         evaluate(GROUND, Evaluation("greedy", place("Short"), episodes=1))
+    with pytest.raises(BadModel, match="lacks the method"):  # before the first training
+        CompareCommand(("ground",), methods=("none", place("Unwritten")), runs=Path("/dev/null/no")).run()
     with pytest.raises(ValueError, match="tuning knows settings of the rivals"):
         CompareCommand(("ground",), methods=(place("Half"),), tune=True, results=Path("none")).run()
 
