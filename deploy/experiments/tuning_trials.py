@@ -147,7 +147,11 @@ def value_in_use(cell: dict[str, Any], footprint: float) -> float | None:
 
 
 def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> list[FilterTuning | LearnerTuning]:
-    """Return the jobs that tune the rivals among some methods."""
+    """Return the jobs that tune the rivals among some methods.
+
+    Raises:
+        ValueError: a method is code of your own, or the task lacks a scripted policy that the tuning drives by.
+    """
     jobs: list[FilterTuning | LearnerTuning] = []
     task = robot_with_task(robot).task
     for method in methods:
@@ -163,6 +167,8 @@ def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> 
                 own = replace(cell, td3=replace(used, **changed), episodes=EPISODES)
                 jobs.append(LearnerTuning(robot, method, value, own))
         elif rival not in (NONE, DDPC) and METHODS[method].learner != SAC_LEARNER:
+            if missing := [name for name in (ORACLE, GREEDY) if name not in task.policies]:
+                raise ValueError(f"the tuning drives by scripted policies, and the task of {robot} has no {missing[0]}")
             values = values_of(rival, robot_with_task(robot))
             own_task = task_hash(robot)
             jobs += [FilterTuning(robot, method, value, task.simulator_version, task=own_task) for value in values]

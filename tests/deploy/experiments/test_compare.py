@@ -391,6 +391,8 @@ def test_a_robot_of_ones_own_is_compared_behind_the_model_set_in_use_and_in_the_
     assert (cell.model_config.mode, cell.arenas, len(others)) == ("direct", ("default", "dense"), 1)
     with pytest.raises(UnknownName, match="no arena is called 'dense'"):
         CompareCommand(methods=("ddpc",), seeds=(0,), arenas=("dense",))._jobs(skid)
+    with pytest.raises(ValueError, match="has no greedy"):
+        tuning_jobs(skid, ("secas",), ("default",))
 
 
 def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_path, monkeypatch):
