@@ -261,6 +261,22 @@ def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
     return kinds[name]
 
 
+STUDIED = ("default", "dense")  # the arenas of a study, unless others are named
+
+
+def studied_arenas(robot: RobotWithTask, names: tuple[str, ...] = STUDIED) -> tuple[str, ...]:
+    """Return the arenas of a study: those that were named, or those of `STUDIED` that a robot has.
+
+    Raises:
+        UnknownName: the robot has no arena of this name.
+    """
+    if names == STUDIED:
+        names = tuple(name for name in STUDIED if name in robot.task.arenas) or STUDIED[:1]
+    for name in names:
+        arena_kind(robot, name)
+    return names
+
+
 def task_path(name: str) -> Path:
     """Return the path of the task of a robot's name or path.
 

@@ -30,7 +30,7 @@ class CampaignCommand:
     robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Drive these robots."""
     arenas: tuple[str, ...] = ("default", "dense")
-    """Drive in arenas of these names."""
+    """Drive in arenas of these names. A robot of your own without an arena of the name dense drives in default."""
     policies: tuple[str, ...] = ("trained", "random", "adversary")
     """Drive by these policies, as `brakeline evaluate` names them."""
     model_sets: tuple[str, ...] = ("auto",)
@@ -85,14 +85,15 @@ class CampaignCommand:
         from brakeline.deploy.experiments.campaign import CampaignPart, cells_of, log_path, parts_of_cell, search_of
         from brakeline.deploy.experiments.experiment_jobs import complete
         from brakeline.messaging.atomic_files import write_atomically
-        from brakeline.messaging.task import address, robot_with_task
+        from brakeline.messaging.task import address, robot_with_task, studied_arenas
 
         robot = robot_with_task(name)
         near = campaign.NEAR * robot.footprint if self.near is None else self.near
+        arenas = studied_arenas(robot, self.arenas)
         cells = [
             CampaignPart(address(name), arena, policy, model_set, perturbation, near, 0, 1, self.accept_bound)
             for arena, policy, model_set, perturbation in product(
-                self.arenas, self.policies, self.model_sets, self._perturbations(robot.position_dim)
+                arenas, self.policies, self.model_sets, self._perturbations(robot.position_dim)
             )
         ]
         # A mistyped name ends the campaign before it begins; models are made once.

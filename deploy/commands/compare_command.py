@@ -174,14 +174,9 @@ class CompareCommand:
 
     def _arenas(self, robot: str) -> tuple[str, ...]:
         """Return the arenas of a robot's cells. Raises UnknownName: it has no such arena."""
-        from brakeline.messaging.task import arena_kind, robot_with_task
+        from brakeline.messaging.task import robot_with_task, studied_arenas
 
-        described = robot_with_task(robot)
-        if self.arenas == CellConfig.arenas:
-            return tuple(arena for arena in self.arenas if arena in described.task.arenas) or self.arenas[:1]
-        for arena in self.arenas:
-            arena_kind(described, arena)
-        return self.arenas
+        return studied_arenas(robot_with_task(robot), self.arenas)
 
     def _methods(self, robot: str) -> tuple[str, ...]:
         methods = compared_on(robot, self._arenas(robot)) if self.methods is None else self.methods
