@@ -83,7 +83,7 @@ TABLE: dict[str, dict[str, tuple[str, str]]] = {
             "ground --policy astar --episodes 100 --json",
         ),
         "compare": (
-            "Train and evaluate each method from the same seeds; write tables and figures. Continues from results/.",
+            "Train and evaluate each method from the same seeds, and write tables and figures. Reuse stored results.",
             "ground --quick",
         ),
         "campaign": (

@@ -40,12 +40,12 @@ class CampaignCommand:
     """Change the robot like this: as-recorded, noisy, payload, weak-motor, slippery, uneven (ground robots), wind (in
     the air), scan or faulty-scan."""
     episodes: int = 1000
-    """Drive this many episodes of each cell. A later campaign with more of them goes on after these."""
+    """Drive this many episodes of each cell. A later campaign with more episodes continues after these."""
     search: int = 0
     """Also search for the worst case of each arena, model set and perturbation, for this many episodes."""
     near: float | None = None
-    """Keep the log of each episode that comes nearer than this to something [m]. Defaults to 5 % of the radius of the
-    robot."""
+    """Store the log of each episode in which the robot comes nearer than this to something [m]. Defaults to 5 % of the
+    radius of the robot."""
     accept_bound: options.AcceptBound = None
     engine: options.Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     again: bool = False

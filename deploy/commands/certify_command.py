@@ -51,8 +51,8 @@ class CertifyCommand:
     does, free takes every window, and auto takes every window if the others are too few."""
     few: bool = False
     """In the linear modes, accept minutes of driving instead of hours: 60 windows of each length suffice instead of
-    200, and each error bound is scaled by 1.5 instead of 1.15, as after `collect --url`. In mode one-step, only the
-    bound of the stopping distance is scaled like this."""
+    200, and each error bound is scaled by 1.5 instead of 1.15, as `collect --url` does. In mode one-step, this option
+    scales only the bound of the stopping distance."""
     outside: float = ModelConfig.outside
     """Let this share of the recorded plans leave their sets in mode one-step. A larger share makes the sets narrower
     and the stated bound larger."""

@@ -159,7 +159,7 @@ class PhysicsOptions:
     process_noise: float = 1.0
     """Scale the disturbances of the ground robot's motion by this factor: unequal motors, uneven wheels and floor."""
     wind: float = 0.0
-    """Blow at the quadrotor with this mean wind speed [m/s]. Each episode draws its direction anew."""
+    """Let a wind of this mean speed blow at the quadrotor [m/s]. Each episode draws the direction of the wind anew."""
     gust: float = 0.0
     """Let the wind vary on each axis with this standard deviation [m/s]."""
     perception: Literal["map", "scan"] = "map"
@@ -198,8 +198,8 @@ class SimulationOptions(PhysicsOptions):
     """Set how the simulated robot differs from the robot that was recorded, or let its model set simulate it."""
 
     learned: bool = False
-    """Simulate the robot by its model set of mode one-step, made of its own log, instead of by the simulator of its
-    task."""
+    """Simulate the robot with its model set of mode one-step, which was fitted to its own log, instead of with the
+    simulator of its task."""
 
     def conditions(self) -> Conditions:
         """Return the simulator's conditions for these options. Raises ValueError if the options contradict."""

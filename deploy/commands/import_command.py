@@ -30,8 +30,8 @@ class ImportCommand:
     out: Path | None = None
     """Write the data set to this file. Defaults to the data set in use, data/ROBOT/record.safetensors."""
     map: tuple[str, ...] = ()
-    """Read a coordinate, an input or the time from this place of the log, if it is not found by its name. Write
-    NAME=TABLE/FIELD, or NAME=COLUMN for a file of columns."""
+    """Read a coordinate, an input or the time from this place of the log, if the command does not find it by its name.
+    Write NAME=TABLE/FIELD, or NAME=COLUMN for a file of columns."""
     delay: float = 0.0
     """Add this time to the stamps of the inputs, if these are too early [s]. If they are too late, give a negative
     time. The report says how long after its inputs the robot moves."""

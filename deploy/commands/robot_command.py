@@ -36,8 +36,8 @@ class RobotCommand:
     """The options of `brakeline robot`."""
 
     action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
-    """Choose what to do: new writes a description with comments, check lists all mistakes in one, show prints what
-    follows from it."""
+    """Choose what to do: new writes a description with comments, check lists all mistakes in a description, and show
+    prints the values that follow from it, such as the order and the units of state and inputs."""
     file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Write or read this description (.toml). With check and show, you may name a robot that comes with the program."""
     from_: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = ()
@@ -45,8 +45,8 @@ class RobotCommand:
     run contains the whole description."""
     map: tuple[str, ...] = ()
     """With --from, name the coordinates, the inputs and the time, each with its place in the log: NAME=TABLE/FIELD, or
-    NAME=COLUMN for a file of columns (of which the command then reads no others). The name of an input begins with
-    `command `."""
+    NAME=COLUMN for a file of columns. The command then reads only the named columns of this file. The name of an input
+    begins with `command `."""
     reading: Unprefixed[LogReadOptions] = field(default_factory=LogReadOptions)
     json: Json = False
 

@@ -25,9 +25,9 @@ class SafetyCommand:
     name: str = "safety"
     """Give the service this name on the bus. Each replica needs its own."""
     adapt: bool = False
-    """Certify a robot anew while it drives: if the filter widens its sets for long, a certifier process fits a model
-    set to the last minutes and puts it to use. The certifier reads the steps of the actors from the bus, and needs the
-    keys of `certify` in --keys. Give this option to one replica."""
+    """Certify a robot anew while it drives. If the filter widens the sets of the robot for some time, a certifier
+    process fits a model set to the last minutes and puts it to use. The certifier reads the steps of the actors from
+    the bus, and needs the keys of `certify` in --keys. Give this option to one replica."""
 
     def run(self) -> int:
         """Answer requests until SIGINT or SIGTERM. Returns the exit status."""

@@ -48,7 +48,7 @@ class FirstFlightSettings:
     acceleration_age: float | None = None
     """Record the horizontal acceleration of this long ago instead of the present one [s], at most 1. By default a
     control period (0.2) behind ArduPilot, which plans its acceleration ahead, and 0 behind other autopilots. `fly`
-    then reports the same one."""
+    then uses the same age."""
 
 
 def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: Path) -> FirstFlightResult:
