@@ -17,10 +17,9 @@ import numpy as np
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_batch
 from brakeline.deploy.experiments.episode_table import COLUMNS, Column, EpisodeTable
-from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process
+from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process, model_of
 from brakeline.deploy.experiments.trials import TrialLog, take_step
 from brakeline.deploy.policy_loading import network_named
 from brakeline.deploy.vehicle_factory import environment
@@ -66,9 +65,7 @@ class CampaignDriver:
     @staticmethod
     def of(robot: RobotWithTask, evaluation: Evaluation) -> CampaignDriver:
         """Load the model set and the environment. Raises what `in_process` and `environment` raise."""
-        model = None
-        if evaluation.method != "none":
-            model = method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
+        model = model_of(robot, evaluation)
         ask = None if model is None else in_process(model, evaluation.accept_bound)
         return CampaignDriver(
             robot,
