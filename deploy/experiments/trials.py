@@ -33,6 +33,9 @@ from brakeline.sim.scripted_policies import Policy, scripted
 FLUSH = 2000  # messages per write
 RUN = 1  # run number: a launched process has a random one
 
+Take = Callable[[pb.Step], object]
+Begin = Callable[[pb.Episode], object]
+
 
 class TrialLog:
     """Writes steps, episodes and exchanges to an MCAP file as the recorder does. An existing file is replaced."""
@@ -135,13 +138,7 @@ def fresh_trial(
     return run_trial(driver, policy_named(policy, robot, 0), ask, episodes)
 
 
-def train_in_lockstep(
-    driver: EpisodeRunner,
-    ask: Ask | None,
-    learner: Learner,
-    take: Callable[[pb.Step], object],
-    begin: Callable[[pb.Episode], object],
-) -> MLP:
+def train_in_lockstep(driver: EpisodeRunner, ask: Ask | None, learner: Learner, take: Take, begin: Begin) -> MLP:
     """Train with one robot and one learner, and return the last policy.
 
     The learner makes all due updates before the next step.
