@@ -21,7 +21,7 @@ from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_ba
 from brakeline.deploy.experiments.episode_table import COLUMNS, Column, EpisodeTable
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process, model_of
 from brakeline.deploy.experiments.trials import TrialLog, take_step
-from brakeline.deploy.policy_loading import network_named
+from brakeline.deploy.policy_loading import driving, network_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoBatch
 from brakeline.logs.episode_stats import closest_of
@@ -106,8 +106,7 @@ class CampaignDriver:
         name = self.evaluation.policy
         if name in self.robot.task.policies:
             return scripted(name, self.robot, np.random.default_rng((self.evaluation.seed, number)))
-        network = network_named(name, self.robot, self.evaluation.seed)
-        return lambda observation, info: network(observation)
+        return driving(network_named(name, self.robot, self.evaluation.seed))
 
     def log(self, path: Path, **about: str) -> TrialLog:
         """Open the log of an episode, with all that a replay needs. about: further entries of its `run`."""
