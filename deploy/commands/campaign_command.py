@@ -134,7 +134,7 @@ class CampaignCommand:
 
     def _prepared(self, robot: RobotWithTask, cell: CampaignPart) -> CampaignPart:
         """Check the names of a cell, make the model set that it needs, and note the versions of all files."""
-        from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.experiments.evaluate import model_of
         from brakeline.deploy.experiments.experiment_jobs import task_hash
         from brakeline.deploy.policy_loading import policy_hash, policy_named
         from brakeline.messaging.task import arena_kind
@@ -151,7 +151,6 @@ class CampaignCommand:
                 "changed: drive it with `brakeline evaluate`"
             )
         policy_named(cell.policy, robot, 0)
-        what, model = cell.evaluation(), ""
-        if what.method != "none":
-            model = method_for(robot, what.method, what.model_config, what.accept_bound).version
-        return replace(cell, model=model, weights=policy_hash(cell.policy, robot), task=task_hash(cell.robot))
+        model = model_of(robot, cell.evaluation())
+        version = "" if model is None else model.version
+        return replace(cell, model=version, weights=policy_hash(cell.policy, robot), task=task_hash(cell.robot))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -79,24 +80,14 @@ class RobotCommand:
         try:
             robot = robot_named(self.file)
         except BadDescription as error:
-            if self.json:
-                print_json({"file": self.file, "problems": [list(problem) for problem in error.problems]})
-            else:
-                errors.print(str(error), markup=False)
-            return 1
-        remarks, tasked = summary(robot)["remarks"], robot_maybe_with_task(self.file)
-        simulated = isinstance(tasked, RobotWithTask)
+            return self._refuse(error.problems, str(error))
+        remarks, tasked, collect = summary(robot)["remarks"], robot_maybe_with_task(self.file), ""
         if isinstance(tasked, RobotWithTask):
             problems, missing = _code_problems(tasked.task)
-            remarks = [*remarks, *missing]
+            remarks, collect = [*remarks, *missing], f", or `brakeline collect {self.file}`"
             if problems:
                 lines = "".join(f"\n  {place}: {what}" for place, what in problems)
-                if self.json:
-                    print_json({"file": self.file, "problems": problems})
-                else:
-                    errors.print(f"{robot.name}: the task names code that cannot be used:{lines}", markup=False)
-                return 1
-        collect = f", or `brakeline collect {self.file}`" if simulated else ""
+                return self._refuse(problems, f"{robot.name}: the task names code that cannot be used:{lines}")
         print_result(
             self.json,
             {"file": self.file, "problems": [], "remarks": remarks},
@@ -105,6 +96,14 @@ class RobotCommand:
             f"next: `brakeline import LOG --robot {self.file}`{collect}",
         )
         return 0
+
+    def _refuse(self, problems: Sequence[tuple[str, str]], text: str) -> int:
+        """Print the mistakes, and return the exit status."""
+        if self.json:
+            print_json({"file": self.file, "problems": problems})
+        else:
+            errors.print(text, markup=False)
+        return 1
 
     def _show(self) -> int:
         robot = robot_named(self.file)

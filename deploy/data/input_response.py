@@ -103,7 +103,8 @@ def response_by_lag(recordings: Sequence[tuple[Series, Series, float, float]], p
     sampled = float(np.median(np.concatenate([np.diff(follower[0]) for _, follower, _, _ in recordings])))
     step = max(sampled, period / STEPS_PER_PERIOD)
     most = math.ceil(max(MAX_DELAY * period, MAX_LAG) / step)
-    total, energy, motion = np.zeros(2 * most + 1), 0.0, 0.0
+    lags = range(-most, most + 1)
+    total, energy, motion = np.zeros(len(lags)), 0.0, 0.0
     for inputs, (follower_time, follower), begin, end in recordings:
         times = np.arange(begin, end, step)
         if len(times) <= most + 2:
@@ -113,7 +114,7 @@ def response_by_lag(recordings: Sequence[tuple[Series, Series, float, float]], p
         # A change at t[i] shows in the step after t[i].
         changed, moved = changed[:-1], moved[1:]
         n = len(changed)
-        total += [float(changed[max(-k, 0) : n - max(k, 0)] @ moved[max(k, 0) : n + min(k, 0)]) for k in _lags(most)]
+        total += [float(changed[max(-k, 0) : n - max(k, 0)] @ moved[max(k, 0) : n + min(k, 0)]) for k in lags]
         energy, motion = energy + float(changed @ changed), motion + float(moved @ moved)
     size = float(np.sqrt(energy * motion))
     return step, total / size if size > 0.0 else total
@@ -123,7 +124,3 @@ def hold_at(series: Series, times: Array) -> Array:
     """Return the last value of a series at or before each time."""
     time, values = series
     return values[np.clip(np.searchsorted(time, times, "right") - 1, 0, None)]
-
-
-def _lags(most: int) -> range:
-    return range(-most, most + 1)

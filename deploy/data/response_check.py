@@ -13,7 +13,7 @@ import numpy as np
 
 from brakeline.deploy.data.gap_free_recordings import GapFreeRecording
 from brakeline.deploy.data.input_response import MAX_DELAY, followed_inputs, hold_at, response_by_lag
-from brakeline.deploy.data.motion_check import MAX_LAG
+from brakeline.deploy.data.motion_check import MAX_LAG, agreement
 from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.data.sources.source_table import Array, Series
 from brakeline.errors import NoSource
@@ -98,16 +98,10 @@ def _unrelated(name: str, follower: str, series: Recordings, period: float, move
             f"{name} is always {held[0]:.6g}, but {follower}, which follows it, moves: the column does not hold what "
             f"the robot was sent. Name the right one with --map {shlex.quote(name)}=COLUMN"
         )
-    if max(abs(_correlation(held, values)) for values in followers) > UNRELATED:
+    if max(abs(agreement(held, values)[0]) for values in followers) > UNRELATED:
         return ""
     return (
         f"{follower} does not follow {name} (correlation below {UNRELATED:g}): the columns are swapped, or the input "
         f"is of another drive. Name the right one with --map {shlex.quote(name)}=COLUMN, or correct `follows` in the "
         "description"
     )
-
-
-def _correlation(one: Array, other: Array) -> float:
-    one, other = one - one.mean(), other - other.mean()
-    size = float(np.sqrt((one @ one) * (other @ other)))
-    return float(one @ other) / size if size > 0.0 else 0.0

@@ -17,12 +17,11 @@ import numpy as np
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_batch
 from brakeline.deploy.experiments.episode_table import COLUMNS, Column, EpisodeTable
-from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process
+from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process, model_of
 from brakeline.deploy.experiments.trials import TrialLog, take_step
-from brakeline.deploy.policy_loading import network_named
+from brakeline.deploy.policy_loading import driving, network_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoBatch
 from brakeline.logs.episode_stats import closest_of
@@ -66,9 +65,7 @@ class CampaignDriver:
     @staticmethod
     def of(robot: RobotWithTask, evaluation: Evaluation) -> CampaignDriver:
         """Load the model set and the environment. Raises what `in_process` and `environment` raise."""
-        model = None
-        if evaluation.method != "none":
-            model = method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
+        model = model_of(robot, evaluation)
         ask = None if model is None else in_process(model, evaluation.accept_bound)
         return CampaignDriver(
             robot,
@@ -109,8 +106,7 @@ class CampaignDriver:
         name = self.evaluation.policy
         if name in self.robot.task.policies:
             return scripted(name, self.robot, np.random.default_rng((self.evaluation.seed, number)))
-        network = network_named(name, self.robot, self.evaluation.seed)
-        return lambda observation, info: network(observation)
+        return driving(network_named(name, self.robot, self.evaluation.seed))
 
     def log(self, path: Path, **about: str) -> TrialLog:
         """Open the log of an episode, with all that a replay needs. about: further entries of its `run`."""

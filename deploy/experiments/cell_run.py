@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +25,7 @@ from brakeline.deploy.experiments.comparison_cells import (
 from brakeline.deploy.experiments.episode_table import EpisodeTable
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
-from brakeline.deploy.experiments.trials import TrialLog, run_trial, train_in_lockstep
+from brakeline.deploy.experiments.trials import Begin, Take, TrialLog, run_trial, train_in_lockstep
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, driving, network_named
 from brakeline.deploy.run.batch_trainer import BatchTrainer
 from brakeline.deploy.vehicle_factory import environment
@@ -47,9 +46,6 @@ PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
 COUNTED = {"goals": "goal", "timeouts": "timeout", "contacts_moving": "contact_moving"}
 COUNTED["contacts_standing"] = "contact_standing"  # figures of a log, and the columns that count the same
 LOGGED = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
-
-Take = Callable[[pb.Step], object]
-Begin = Callable[[pb.Episode], object]
 
 
 def progress(table: EpisodeTable) -> str:

@@ -129,7 +129,7 @@ def prepare_fleet(
 
 def _ask_for(robot: RobotWithTask, evaluation: Evaluation) -> Ask | None:
     """Return the function that asks the filter, or None for the method `none`."""
-    model = _model_for(robot, evaluation)
+    model = model_of(robot, evaluation)
     if model is None:
         return None
     ask = in_process(model, evaluation.accept_bound)
@@ -148,7 +148,8 @@ def _raising(ask: Ask, method: str) -> Ask:
     return raising
 
 
-def _model_for(robot: RobotWithTask, evaluation: Evaluation) -> Model | None:
+def model_of(robot: RobotWithTask, evaluation: Evaluation) -> Model | None:
+    """Return the model of an evaluation's method, or None for the method `none`. Raises what `method_for` raises."""
     if evaluation.method == "none":
         return None
     return method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
@@ -308,7 +309,7 @@ def _figures(robot: RobotWithTask, evaluation: Evaluation, parts: Sequence[Drive
         }
     else:
         figures["by_episode"] = {name: [value for part in parts for value in part.rows[name]] for name in ROWS}
-    filtered, model = evaluation.method == DDPC, _model_for(robot, evaluation)
+    filtered, model = evaluation.method == DDPC, model_of(robot, evaluation)
     return figures | {
         "method": evaluation.method,
         "model": None if model is None else model.version,

@@ -164,5 +164,4 @@ def complete(
         missing = [job for job in missing if read(results, job) is None]
         for job, result in engine.completed(missing, runs, say):
             write(results, job, result)
-    stored = [read(results, job) for job in jobs]
-    return [result for result in stored if result is not None]
+    return [result for job in jobs if (result := read(results, job)) is not None]

@@ -197,13 +197,12 @@ def _methods(robot_results: RobotResults) -> str:
 
 
 def _main(robot_results: RobotResults) -> list[str]:
-    lines = []
     heads = ["method", "n", *(f"goals, `{arena}`" for arena in robot_results.arenas), "goals, all arenas"]
     rows = []
     for method, cells in robot_results.cells.items():
         scores = [_iqm(aggregate(robot_results.goals(method, [arena])[0])) for arena in robot_results.arenas]
         rows.append([compared(method).label, str(len(cells)), *scores, _iqm(aggregate(robot_results.goals(method)))])
-    lines += [*markdown_table(heads, rows), ""]
+    lines = [*markdown_table(heads, rows), ""]
     heads = ["method", *(f"collisions, `{arena}`" for arena in robot_results.arenas), "collisions in a training"]
     rows = []
     for method in robot_results.cells:
@@ -268,9 +267,9 @@ def _tuning(results: Path, robot: RobotWithTask, robot_results: RobotResults) ->
     rows = []
     for method, values in tried.items():
         values.sort(key=lambda row: row["value"])
-        best = _best(method, values)
-        users = [name for name in robot_results.cells if name == method]
-        used = value_in_use(robot_results.cells[users[0]][0], robot.footprint) if users else None
+        best = (best_learner if method in SETTINGS else best_threshold)(values)["value"]
+        cells = robot_results.cells.get(method)
+        used = value_in_use(cells[0], robot.footprint) if cells else None
         figures = [_tried(row) for row in values]
         chosen = f"{best:g}", "–" if used is None else f"{used:g}"
         rows.append([compared(method).label, compared(method).tuned, *figures, *chosen])
@@ -278,11 +277,6 @@ def _tuning(results: Path, robot: RobotWithTask, robot_results: RobotResults) ->
     heads = ["method", "setting", *(f"value {i + 1}" for i in range(most)), "best", "in use"]
     padded = [[*row[:-2], *[""] * (len(heads) - len(row)), *row[-2:]] for row in rows]
     return [TUNING, *markdown_table(heads, padded), ""]
-
-
-def _best(method: str, rows: Sequence[Result]) -> float:
-    best = best_learner if method in SETTINGS else best_threshold
-    return float(best(rows)["value"])
 
 
 def _tried(row: Result) -> str:

@@ -7,7 +7,6 @@ so that the same evaluations drive it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,17 +18,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from brakeline.actors.episode_runner import ActorIdentity
 from brakeline.deploy.batch_robots import BatchRobots
 from brakeline.deploy.experiments.comparison_cells import CellConfig
+from brakeline.deploy.experiments.trials import Begin, Take
 from brakeline.deploy.run.batch_trainer import actor_names
-from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.sim.navigation_env import action_and_observation_space
 
 CAPACITY = 200_000  # steps of the replay buffer, as our learner's
-
-Take = Callable[[pb.Step], object]
-Begin = Callable[[pb.Episode], object]
 
 
 class RobotsAsVecEnv(VecEnv):

@@ -33,6 +33,9 @@ from brakeline.sim.scripted_policies import Policy, scripted
 FLUSH = 2000  # messages per write
 RUN = 1  # run number: a launched process has a random one
 
+Take = Callable[[pb.Step], object]
+Begin = Callable[[pb.Episode], object]
+
 
 class TrialLog:
     """Writes steps, episodes and exchanges to an MCAP file as the recorder does. An existing file is replaced."""
@@ -46,19 +49,13 @@ class TrialLog:
         self._waiting: list[Entry] = []
         self._count: dict[str, int] = {}
 
-    def put_exchange(self, exchange: pb.Exchange) -> None:
-        """Add a request with its reply."""
-        self._put(EXCHANGE, exchange, exchange.request.robot, exchange.request.actor)
-
-    def put(self, topic: Topic, message: pb.Step | pb.Episode) -> None:
+    def put(self, topic: Topic, message: pb.Step | pb.Episode | pb.Exchange) -> None:
         """Add a message, and number it."""
-        self._put(topic, message, message.robot, message.actor)
-
-    def _put(self, topic: Topic, message: pb.Step | pb.Episode | pb.Exchange, robot: str, actor: str) -> None:
-        key = topic.at(robot=robot, source=actor)
+        about = message.request if isinstance(message, pb.Exchange) else message
+        key = topic.at(robot=about.robot, source=about.actor)
         self._count[key] = number = self._count.get(key, 0) + 1
         header, now = message.header, steady_time_ns()
-        header.sequence, header.source, header.run, header.wall_time = number, actor, RUN, now
+        header.sequence, header.source, header.run, header.wall_time = number, about.actor, RUN, now
         self._waiting.append(
             Entry(key, type(message), message.SerializeToString(), now, int(header.time * 1e9) or now, number)
         )
@@ -104,7 +101,7 @@ def take_step(
     if outcome is not None and outcome.answer is None:
         raise RuntimeError(f"no decision: {outcome.failure}")
     if requests is not None and outcome is not None:
-        requests.put_exchange(outcome.exchange(float(driver.info["time"])))
+        requests.put(EXCHANGE, outcome.exchange(float(driver.info["time"])))
     step = driver.execute(proposal, outcome, version)
     step.propose_ms = spent_ms
     return step
@@ -135,13 +132,7 @@ def fresh_trial(
     return run_trial(driver, policy_named(policy, robot, 0), ask, episodes)
 
 
-def train_in_lockstep(
-    driver: EpisodeRunner,
-    ask: Ask | None,
-    learner: Learner,
-    take: Callable[[pb.Step], object],
-    begin: Callable[[pb.Episode], object],
-) -> MLP:
+def train_in_lockstep(driver: EpisodeRunner, ask: Ask | None, learner: Learner, take: Take, begin: Begin) -> MLP:
     """Train with one robot and one learner, and return the last policy.
 
     The learner makes all due updates before the next step.

@@ -158,7 +158,7 @@ class Adaptation:
 
         Raises Implausible if there are too many robots.
 
-        heard: when it arrived [s], by a clock of this process. The clocks of other machines may differ by hours.
+        arrived: when it arrived [s], by a clock of this process. The clocks of other machines may differ by hours.
         """
         if not exchange.reply.HasField("decision"):
             return
@@ -273,7 +273,7 @@ class Adaptation:
         most = _largest_half_width(in_use, widening, data)
         room = Filter(in_use).constraints.plan_widening(widening) * room_to_stand(in_use)
         updatable = in_use.model_config.mode == ONE_STEP and not covered.narrower
-        ways = (_fitted, _updated) if updatable else (_fitted,)
+        ways = (_fitted, certify_update) if updatable else (_fitted,)
         tried = [self._tried(way, in_use, data, most, room) for way in ways]
         if all(result.model is None for _, result in tried):
             return Recertification(f"none {why}: {'; '.join(result.text for _, result in tried)}")
@@ -304,7 +304,7 @@ class Adaptation:
         stated = (
             f"±{1e3 * report.half_width_full:.0f} mm after a full stop, at most {percent(report.bound_plan)} outside"
         )
-        return width, Recertification(f"{NAMES[way]}: {stated}", model, data=None if way is _updated else data)
+        return width, Recertification(f"{NAMES[way]}: {stated}", model, data=None if way is certify_update else data)
 
     def _outside(self, in_use: ModelSet, data: Dataset) -> float:
         """Return the share of the windows that may leave the new sets: that of the set in use, or less.
@@ -366,13 +366,8 @@ def _fitted(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, 
     return certify(data, ModelConfig(mode=ONE_STEP, outside=outside))
 
 
-def _updated(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
-    """Update the set in use to the recent driving. It keeps its domain."""
-    return certify_update(in_use, data, outside)
-
-
 Way = Callable[[ModelSet, Dataset, float], tuple[ModelSet, ValidationReport]]
-NAMES: dict[Way, str] = {_fitted: "a fit to this driving", _updated: "an update of the set in use"}
+NAMES: dict[Way, str] = {_fitted: "a fit to this driving", certify_update: "an update of the set in use"}
 
 
 def _largest_half_width(in_use: ModelSet, widening: float, data: Dataset) -> float:

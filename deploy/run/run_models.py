@@ -85,10 +85,8 @@ def models_of_resumed_run(config: RunConfig, folder: Path) -> list[Model]:
     models = []
     for name in config.robots:
         robot = robot_maybe_with_task(name)
-        archived, in_use = (
-            newest_model(folder, robot.name, None),
-            method_path(robot, config.method, config.model_config),
-        )
+        archived = newest_model(folder, robot.name, None)
+        in_use = method_path(robot, config.method, config.model_config)
         if archived is None:
             missing = archive_path(folder, robot.name, "*")
             raise BadModel(f"{folder} can't be resumed: no model of {robot.name} in {missing.parent}. Start a new run")

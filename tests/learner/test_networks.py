@@ -146,10 +146,14 @@ def test_learns_a_bandit_in_bfloat16():
     assert float((action - batch.observation).square().mean()) < 0.02
 
 
-WRONG = {"batch": 0, "warmup": 1, "gamma": 1.5, "hidden": (), "tau": 0.0, "multiplier_rate": 0.0}
+NAN = float("nan")
+WRONG = {"batch": 0, "warmup": 1, "gamma": 1.5, "hidden": (), "tau": 0.0, "multiplier_rate": 0.0, "cost_limit": 1.0}
+WEIGHTS = [("imitation must be", -1.0), ("imitation must be", NAN), ("penalty_growth must be", 0.5)]
+NUMBERS = ("updates_per_step", "actor_rate", "exploration_noise", "reward_scale")
+NO_NUMBERS = [(f"{name} = nan is not finite", NAN) for name in NUMBERS]
 
 
-@pytest.mark.parametrize(("name", "value"), [*WRONG.items(), ("cost_limit", 1.0), ("cost_limit", -0.1)])
-def test_configurations_that_cannot_be(name, value):
-    with pytest.raises(ValueError, match=f"^[^:]*{name}"):
-        TD3Config(**{name: value})
+@pytest.mark.parametrize(("said", "value"), [*WRONG.items(), ("cost_limit", -0.1), *WEIGHTS, *NO_NUMBERS])
+def test_configurations_that_cannot_be(said, value):
+    with pytest.raises(ValueError, match=f"^[^:]*{said}"):
+        TD3Config(**{said.split()[0]: value})

@@ -27,10 +27,6 @@ def wrapped(angles):
     return (angles + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def mirror_y(values):
-    values[:, Y] *= -1.0
-
-
 def clockwise_from_y(values):
     values[:, HEADING] = wrapped(math.pi / 2.0 - values[:, HEADING])
 
@@ -72,7 +68,7 @@ def nothing_sent(values):
 @pytest.mark.parametrize(
     ("mistake", "said"),
     [
-        (mirror_y, "Write -heading into the column, or change the sign of y"),
+        (opposite(Y), "Write -heading into the column, or change the sign of y"),
         (clockwise_from_y, "Write pi/2 - heading into the column, or swap the columns x and y"),
         (swap(X, Y), "or swap the columns x and y"),
         (opposite(W), "w has the opposite sign of the turn rate of the positions"),

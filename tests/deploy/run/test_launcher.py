@@ -2,7 +2,6 @@
 
 import errno
 import fcntl
-import io
 import itertools
 import json
 import os
@@ -14,11 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
-from brakeline.deploy.run.display import summary
 from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
@@ -31,6 +28,7 @@ from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
+from tests.deploy.run.test_display import rows_of
 from tests.waiting import PATIENCE, until
 
 
@@ -196,8 +194,7 @@ def test_the_summary_says_what_the_log_lacks_not_what_the_launcher_missed(tmp_pa
     figures = launcher.figures()
     assert figures["log_messages"] == {"recorded": 6, "missing": 4, "failures": [notes["failure"]]}
     assert sum(topic["missing"] for topic in figures["topics"].values()) == 6, "of the recorder's signs of life"
-    shown = summary_of(figures)
-    assert "messages in the log: 6; NOT in the log: 4 ([Errno 28] No space left on device)" in shown
+    assert "messages in the log: 6; NOT in the log: 4 ([Errno 28] No space left on device)" in rows_of(figures)
     (tmp_path / "run_0003.mcap").write_bytes(b"no log at all")
     (failure,) = launcher.figures()["log_messages"]["failures"][1:]
     assert "run_0003.mcap is not an MCAP file" in failure
@@ -244,12 +241,6 @@ def test_the_figures_say_whether_they_count_from_a_resumption_on(tmp_path: Path)
         assert launcher.figures()["resumed"] is resumed
 
 
-def summary_of(figures: dict[str, object]) -> str:
-    console = Console(file=io.StringIO(), width=200)
-    summary(console, figures)
-    return console.file.getvalue()
-
-
 def test_steps_that_the_learner_refuses_do_not_count(launcher: Launcher) -> None:
     """An actor floods: 20 steps that it may take, then thousands beyond its limit, repeated ones and ones gone back."""
 
@@ -271,6 +262,6 @@ def test_steps_that_the_learner_refuses_do_not_count(launcher: Launcher) -> None
     say(launcher, STEP, step(0, 9))
     figures = launcher.figures()
     assert (figures["steps"], figures["refused"]) == (20, 4004)
-    assert "4004 steps do not count: repeated, or not permitted by the learner" in summary_of(figures)
+    assert "4004 steps do not count: repeated, or not permitted by the learner" in rows_of(figures)
     say(launcher, STEP, step(21))
     assert launcher.figures()["steps"] == 21
