@@ -30,6 +30,14 @@ SURFACE_STEP = 0.15  # m between two ranges: a larger step is between two surfac
 STEEPEST = math.radians(89.0)  # of 45° + Δ: beyond it, an edge may lie along the beams
 
 
+def hits_of(scan: Scan) -> tuple[NDArray[np.intp], Array]:
+    """Return the beams (k,) that hit something, and their ends (k, 2) [m], world."""
+    at, heading = scan.sensor()
+    beams = np.flatnonzero(scan.valid_beams & (scan.ranges < scan.far))
+    angles = heading + scan.angles[beams]
+    return beams, at + scan.ranges[beams, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
 def gaps(scan: Scan) -> tuple[Array, Array, Array]:
     """Return the first angle [rad], the width [rad] and F [m] of each gap between two known beams, around the turn.
 
