@@ -296,11 +296,8 @@ class PlanSearch:
         and a row that forbids inputs that move the robot nearer than the strongest braking does.
         """
         if at.tightened is None:
-            at.tightened = self._tightened(at)
+            rows, too_near = at.rows, self._too_near_to_turn(at)
+            stay, room = self._staying[0], 2.0 * self.safety.builder.tightening
+            parts = rows.gradient, rows.spread, rows.bound, at.kept_off, too_near, self.safety.translating, stay, room
+            at.tightened = ConstraintRows(*qp_kernels.tightened(*parts))
         return at.tightened
-
-    def _tightened(self, at: Linearized) -> ConstraintRows:
-        rows, too_near = at.rows, self._too_near_to_turn(at)
-        stay, room = self._staying[0], 2.0 * self.safety.builder.tightening
-        parts = rows.gradient, rows.spread, rows.bound, at.kept_off, too_near, self.safety.translating, stay, room
-        return ConstraintRows(*qp_kernels.tightened(*parts))
