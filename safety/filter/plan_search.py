@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes, why_not_allowed
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.kernels import qp_kernels, tube_kernels
@@ -27,8 +28,6 @@ from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
-
-Array = NDArray[np.float64]
 
 NO_ROWS = np.zeros(0)
 LINEARIZATIONS = 4  # of a rollout, for one decision and starting point

@@ -16,9 +16,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.scan_coverage import hits_of
-from brakeline.safety.perception.visibility_memory import STEP, Array, FanMemory
+from brakeline.safety.perception.visibility_memory import STEP, FanMemory
 
 CELLS = 128  # along each side of the grid
 CELLS_PER_RADIUS = 10  # of the body's disc

@@ -21,9 +21,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import Scan
-
-Array = NDArray[np.float64]
 
 WIDE = math.radians(3.0)  # a wider gap may hide something else than the surfaces on both sides of it
 SURFACE_STEP = 0.15  # m between two ranges: a larger step is between two surfaces

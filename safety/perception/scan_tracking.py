@@ -21,10 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import BeamTracks, Scan
 from brakeline.safety.perception.scan_coverage import hits_of
-
-Array = NDArray[np.float64]
 
 CAPACITY = 3  # scans
 FEWEST = 2  # earlier scans that must show a surface to stand
