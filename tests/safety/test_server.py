@@ -21,7 +21,7 @@ from brakeline.safety.service.client import SafetyClient, query_service, read_re
 from brakeline.safety.service.wire import MAX_BATCH_SIZE
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
-from tests.safety.served import Service
+from tests.safety.served import Service, with_fields
 
 NAN, INF = float("nan"), float("inf")
 AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
@@ -61,14 +61,7 @@ def test_a_standing_robot_with_widened_sets_reserves_as_much_as_they_take(servic
 
 
 def bad(**changes):
-    message = good()
-    for name, value in changes.items():
-        if isinstance(value, str | float):
-            setattr(message, name, value)
-        else:
-            message.ClearField(name)
-            getattr(message, name).extend(value)
-    return message
+    return with_fields(good(), **changes)
 
 
 def with_obstacle(**changes):
