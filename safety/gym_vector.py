@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.number_checks import check_numbers
+from brakeline.messaging.robot import Array
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
@@ -25,8 +26,6 @@ from brakeline.safety.service.in_process import InProcess, request_observation
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
-
-Array = NDArray[np.float64]
 
 
 class VectorSafetyWrapper(VectorWrapper):

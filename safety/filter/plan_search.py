@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes, why_not_allowed
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.kernels import qp_kernels, tube_kernels
@@ -27,8 +28,6 @@ from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
-
-Array = NDArray[np.float64]
 
 NO_ROWS = np.zeros(0)
 LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
@@ -296,11 +295,8 @@ class PlanSearch:
         and a row that forbids inputs that move the robot nearer than the strongest braking does.
         """
         if at.tightened is None:
-            at.tightened = self._tightened(at)
+            rows, too_near = at.rows, self._too_near_to_turn(at)
+            stay, room = self._staying[0], 2.0 * self.safety.builder.tightening
+            parts = rows.gradient, rows.spread, rows.bound, at.kept_off, too_near, self.safety.translating, stay, room
+            at.tightened = ConstraintRows(*qp_kernels.tightened(*parts))
         return at.tightened
-
-    def _tightened(self, at: Linearized) -> ConstraintRows:
-        rows, too_near = at.rows, self._too_near_to_turn(at)
-        stay, room = self._staying[0], 2.0 * self.safety.builder.tightening
-        parts = rows.gradient, rows.spread, rows.bound, at.kept_off, too_near, self.safety.translating, stay, room
-        return ConstraintRows(*qp_kernels.tightened(*parts))

@@ -237,21 +237,18 @@ def stack_recursive(
     position_dim: int,
     chord_deviations: ErrorBound | None = None,
     stopping_distance: ErrorBound | None = None,
-    initial: Array | None = None,
     more: Sequence[int] = (),
 ) -> Tube:
     """Stack the paper's recursion (Lemma 2): step k maps z_k to y_{k+1} = A y_k + B [u_{k-1}; u_k] + error.
 
-    The lengths of the generators solve m = w + t(z) + r + K m, with K strictly lower triangular, so
+    The measured state is the start. The lengths of the generators solve m = w + t(z) + K m, with K strictly lower
+    triangular, so
 
-        m = (I - K)⁻¹ (w + t(z) + r)                                                   (docs/method.md §2)
-
-    initial: generators (n, g) of the set of the first state; r is their share. None: the measured state is exact.
+        m = (I - K)⁻¹ (w + t(z))                                                       (docs/method.md §2)
     """
     n, nz = how.first.shape
     y, before = how.first, how.input(-1)
-    generators = np.zeros((n, 0)) if initial is None else initial  # all generators so far, propagated to step k
-    start = generators.shape[1]
+    generators = np.zeros((n, 0))  # all generators so far, propagated to step k
     regress, coordinates = list(how.E), [*range(position_dim), *more]
     centers, spreads, atoms, K_rows = [], [], [], []
     for k, step in enumerate(steps):
@@ -267,9 +264,8 @@ def stack_recursive(
         before = how.input(k)
         centers.append(y[coordinates])
         spreads.append(generators[coordinates])
-    total = generators.shape[1]
-    W, M, m_0 = _generator_lengths(atoms, K_rows, start, total)
-    directions = np.zeros((len(steps), len(coordinates), total))
+    W, M, m_0 = _generator_lengths(atoms, K_rows)
+    directions = np.zeros((len(steps), len(coordinates), len(m_0)))
     for i, spread in enumerate(spreads):
         directions[i, :, : spread.shape[1]] = spread
     extra = [_atoms(c) for c in (chord_deviations, stopping_distance) if c is not None]
@@ -282,22 +278,19 @@ def stack_recursive(
 
 
 def _generator_lengths(
-    atoms: Sequence[tuple[Array, Array, Array]], K_rows: Sequence[Array], start: int, total: int
+    atoms: Sequence[tuple[Array, Array, Array]], K_rows: Sequence[Array]
 ) -> tuple[Array, Array, Array]:
-    """Solve m = w + t(z) + r + K m for (W, M, m_0), so that m = M |W z| + m_0.
+    """Solve m = w + t(z) + K m for (W, M, m_0), so that m = M |W z| + m_0.
 
-    atoms: `_atoms` of each step; K_rows: the rows of K by step. The first `start` of `total` generators have length 1.
+    atoms: `_atoms` of each step; K_rows: the rows of K by step.
     """
-    K = np.zeros((total - start, total))
-    at = 0
+    w = np.concatenate([w for _, _, w in atoms])
+    K, at = np.zeros((len(w), len(w))), 0
     for row in K_rows:
         K[at : at + len(row), : row.shape[1]] = row
         at += len(row)
-    inverse = np.linalg.inv(np.eye(total - start) - K[:, start:])
-    W = np.vstack([a for a, _, _ in atoms])
-    M = inverse @ _block_diagonal([m for _, m, _ in atoms])
-    m_0 = inverse @ (np.concatenate([w for _, _, w in atoms]) + K[:, :start].sum(1))
-    return W, np.vstack([np.zeros((start, M.shape[1])), M]), np.concatenate([np.ones(start), m_0])
+    inverse = np.linalg.inv(np.eye(len(w)) - K)
+    return np.vstack([W for W, _, _ in atoms]), inverse @ _block_diagonal([M for _, M, _ in atoms]), inverse @ w
 
 
 def _atoms(step: ErrorBound) -> tuple[Array, Array, Array]:

@@ -75,8 +75,5 @@ class SelectionPath:
     def best(self, penalty: float) -> Index:
         """Return the indices of the features with the least criterion. A larger penalty never gives more."""
         counts = np.arange(len(self.squares))
-        with np.errstate(divide="ignore"):
-            criterion = (
-                self.samples * np.log(np.maximum(self.squares, 1e-300)) + penalty * np.log(self.samples) * counts
-            )
+        criterion = self.samples * np.log(np.maximum(self.squares, 1e-300)) + penalty * np.log(self.samples) * counts
         return self.order[: int(criterion.argmin())]

@@ -19,7 +19,7 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import measurement_in
 from brakeline.safety.perception.image_coverage import patch_free_ranges
-from brakeline.safety.perception.scan_coverage import gaps
+from brakeline.safety.perception.scan_coverage import gaps, hits_of
 
 OUTLINE = 120  # corners of a drawn outline, about
 SWEPT = 4  # periods at whose end the reach of a moving obstacle is drawn on pages
@@ -67,7 +67,7 @@ def map_for_display(robot: Robot, request: pb.Request, corners: int = OUTLINE) -
     hits = free = np.zeros((0, robot.position_dim))
     sensed = measurement_in(request)
     if isinstance(sensed, Scan):
-        hits, free = _scan_hits(sensed), _scan_outline(sensed, corners)
+        (_, hits), free = hits_of(sensed), _scan_outline(sensed, corners)
     elif sensed is not None:
         hits, free = _image_hits(sensed), _image_outline(sensed, corners)
     moving = [obstacle_of(o, robot.position_dim) for o in request.obstacles if o.HasField("motion")]
@@ -85,11 +85,11 @@ def map_for_display(robot: Robot, request: pb.Request, corners: int = OUTLINE) -
 def _tracked(scan: Scan, times: Array) -> tuple[Array, Array]:
     """Return a disc around the hits of each tracked surface (k, 3), and that disc at times (N,) [s] after the scan."""
     assert scan.tracks is not None
-    points = np.zeros((len(scan.ranges), 2))
-    points[scan.valid_beams & (scan.ranges < scan.far)] = _scan_hits(scan)
+    beams, ends = hits_of(scan)
+    which = scan.tracks.track_index[beams]
     discs, swept = [np.zeros((0, 3))], [np.zeros((0, len(times), 3))]
     for number, (vx, vy, error, acceleration) in enumerate(scan.tracks.motions, start=1):
-        hits = points[scan.tracks.track_index == number]
+        hits = ends[which == number]
         if not len(hits) or not (vx or vy):
             continue
         center = hits.mean(axis=0)
@@ -98,14 +98,6 @@ def _tracked(scan: Scan, times: Array) -> tuple[Array, Array]:
         radii = radius + error * times + 0.5 * acceleration * times * times
         swept.append(np.column_stack([center + times[:, None] * (vx, vy), radii])[None])
     return np.concatenate(discs), np.concatenate(swept)
-
-
-def _scan_hits(scan: Scan) -> Array:
-    """Return the ends (k, 2) of the beams that hit something."""
-    at, heading = scan.sensor()
-    hit = scan.valid_beams & (scan.ranges < scan.far)
-    angles = heading + scan.angles[hit]
-    return np.asarray(at + scan.ranges[hit, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
 def _scan_outline(scan: Scan, most: int) -> Array:

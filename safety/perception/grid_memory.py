@@ -16,8 +16,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.visibility_memory import STEP, Array, FanMemory
+from brakeline.safety.perception.scan_coverage import hits_of
+from brakeline.safety.perception.visibility_memory import STEP, FanMemory
 
 CELLS = 128  # along each side of the grid
 CELLS_PER_RADIUS = 10  # of the body's disc
@@ -83,10 +85,7 @@ class GridMemory(FanMemory):
 
     def _forget_hits(self, scan: Scan) -> None:
         """Forget the cells at the scan's hits, and their neighbours: something may have come there."""
-        at, heading = scan.sensor()
-        hit = scan.valid_beams & (scan.ranges < scan.far)
-        turned = heading + scan.angles[hit]
-        points = at + scan.ranges[hit, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+        _, points = hits_of(scan)
         points = points[np.linalg.norm(points - np.asarray(scan.pose[:2]), axis=1) > self._footprint]
         cells = np.floor(points / self._cell).astype(int) - self._corner
         around = (cells[:, None] + NEIGHBOURS).reshape(-1, 2)

@@ -27,9 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.range_image import Array, RangeImage
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 SINGLE = 1e-6  # relative error of a few operations in single precision, at most

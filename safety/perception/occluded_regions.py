@@ -14,10 +14,9 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.range_image import RangeImage, directions
+from brakeline.messaging.range_image import Array, RangeImage, directions
 from brakeline.safety.perception.image_coverage import BeamGrid, patch_free_ranges
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 PLANES = 32  # half-spaces of a period at most; a period that needs more has no free space

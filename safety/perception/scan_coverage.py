@@ -21,13 +21,20 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import Scan
-
-Array = NDArray[np.float64]
 
 WIDE = math.radians(3.0)  # a wider gap may hide something else than the surfaces on both sides of it
 SURFACE_STEP = 0.15  # m between two ranges: a larger step is between two surfaces
 STEEPEST = math.radians(89.0)  # of 45° + Δ: beyond it, an edge may lie along the beams
+
+
+def hits_of(scan: Scan) -> tuple[NDArray[np.intp], Array]:
+    """Return the beams (k,) that hit something, and their ends (k, 2) [m], world."""
+    at, heading = scan.sensor()
+    beams = np.flatnonzero(scan.valid_beams & (scan.ranges < scan.far))
+    angles = heading + scan.angles[beams]
+    return beams, at + scan.ranges[beams, None] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def gaps(scan: Scan) -> tuple[Array, Array, Array]:

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.halfspaces import TOUCHING, viewpoints
 from brakeline.safety.perception.occlusion_exits import occlusion_exits
 from brakeline.safety.perception.scan_coverage import WIDE, gaps, gaps_and_motions
-
-Array = NDArray[np.float64]
 
 SPAN = math.radians(12.0)  # of a cell, about
 JUMP = 0.1  # m between the F of two gaps in different cells

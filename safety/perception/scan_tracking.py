@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.scan import BeamTracks, Scan
-
-Array = NDArray[np.float64]
+from brakeline.safety.perception.scan_coverage import hits_of
 
 CAPACITY = 3  # scans
 FEWEST = 2  # earlier scans that must show a surface to stand
@@ -122,18 +122,14 @@ def _only_one(centers: Array, position: Array, within: float) -> Array | None:
 
 
 def _hits(scan: Scan) -> _Hits:
-    at, heading = scan.sensor()
     ranges = np.where(scan.valid_beams, scan.ranges, 0.0)
-    beams = np.flatnonzero(scan.valid_beams & (ranges < scan.far))
-    angles = scan.angles[beams]
-    away = ranges[beams]
-    points = at + away[:, None] * np.column_stack([np.cos(heading + angles), np.sin(heading + angles)])
+    beams, points = hits_of(scan)
     step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     apart = (np.roll(beams, -1) - beams) % len(ranges)
     linked = (step <= LINK) & (apart == 1)
     groups = _groups(scan, ranges, beams, points, linked)
     centers = np.array([points[group].mean(axis=0) for group in groups], dtype=float).reshape(-1, 2)
-    return _Hits(at, heading, beams, angles, points, linked, centers, groups)
+    return _Hits(*scan.sensor(), beams, scan.angles[beams], points, linked, centers, groups)
 
 
 def _groups(

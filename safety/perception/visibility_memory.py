@@ -17,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadRequest
-from brakeline.messaging.obstacle import FARTHEST
+from brakeline.messaging.obstacle import FARTHEST, Array
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import MAX_BEAMS, Scan
 from brakeline.safety.perception.occlusion_exits import minimum_by_sector
 from brakeline.safety.perception.scan_coverage import WIDE, gaps
 from brakeline.safety.perception.scan_tracking import ScanTracker
-
-Array = NDArray[np.float64]
 
 CAPACITY = 12  # scans
 SPACING = 0.04  # m, or a quarter of it in rad: smallest motion between two stored scans

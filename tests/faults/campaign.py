@@ -35,6 +35,7 @@ from tests.faults.chaos import CUT, PATIENCE, ROBOTS, Chaos, Judged, Stuck
 from tests.faults.five_hosts import CLOCKS, TURN, Fleet
 from tests.faults.network_hosts import Hosts
 from tests.faults.small_volume import SmallVolume
+from tests.fuzz.mutations import flipped
 
 LEG = 100  # faults
 MOST_AT_ONCE = 12
@@ -63,7 +64,6 @@ class Leg:
     chaos: Chaos
     counts: Counter[str] = field(default_factory=Counter)
     damages: list[Damage] = field(default_factory=list)
-    filled: set[int] = field(default_factory=set)  # recorders whose disk was full for long enough to be noticed
 
     def group(self, most: int) -> str:
         """Make some faults at a time, undo them, and return their descriptions."""
@@ -82,8 +82,7 @@ class Leg:
 
     def _kill(self) -> tuple[str, float, Callable[[], None]]:
         name = self.random.choice(list(self.fleet.spots))
-        if self.fleet.spots[name].alive:
-            self.fleet.kill(name)
+        self._end(name)
         return f"kill -9 {name}", 0.0, lambda: None
 
     def _stop(self) -> tuple[str, float, Callable[[], None]]:
@@ -170,10 +169,7 @@ class Leg:
     def _flip(self, path: Path) -> bytes:
         """Flip a bit of a file. Returns the file as it was."""
         whole = path.read_bytes()
-        place = self.random.randrange(len(whole))
-        flipped = bytearray(whole)
-        flipped[place] ^= 1 << self.random.randrange(8)
-        _overwrite(path, flipped)
+        _overwrite(path, flipped(whole, self.random.randrange(len(whole)), self.random.randrange(8)))
         return whole
 
 

@@ -7,7 +7,7 @@ import errno
 import io
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -72,7 +72,7 @@ class DiskCalls:
         return call
 
 
-class FailingFile:
+class FailingFile(AbstractContextManager["FailingFile"]):
     """A file whose writes fail half-way."""
 
     def __init__(self, file: Any, calls: DiskCalls, error: Callable[[], BaseException]) -> None:
@@ -91,9 +91,6 @@ class FailingFile:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)
-
-    def __enter__(self) -> FailingFile:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import signal
 import subprocess
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.data.model_store import method_for
@@ -61,7 +60,7 @@ class Spot:
 
 
 @dataclass
-class Fleet:
+class Fleet(AbstractContextManager["Fleet"]):
     """The processes, with their keys, signed models, logs and checkpoints in a folder.
 
     Attributes:
@@ -166,10 +165,7 @@ class Fleet:
         if hasattr(self, "_bus"):
             self._bus.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _hear(self, sample: Sample) -> None:

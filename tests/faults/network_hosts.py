@@ -11,9 +11,8 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 CLOCK = Path(__file__).with_name("clock.c")  # the library that a host with a shifted clock loads first
 MACHINE = 254  # the machine's own number on the switch
@@ -32,7 +31,7 @@ def ip(words: str) -> None:
         raise NoHosts(f"ip {words}: {done.stderr.strip()}")
 
 
-class Hosts:
+class Hosts(AbstractContextManager["Hosts"]):
     """`count` hosts, numbered from 1, until the end of the block."""
 
     def __init__(self, count: int, clocks: Mapping[int, float] | None = None) -> None:
@@ -104,10 +103,7 @@ class Hosts:
             subprocess.run(["ip", "netns", "delete", self._ns(host)], check=False, capture_output=True)
         self._folder.cleanup()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _compiled(self) -> Path | None:

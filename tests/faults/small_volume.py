@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 BLOCK = 4096  # bytes
 
 
-class SmallVolume:
+class SmallVolume(AbstractContextManager["SmallVolume"]):
     """A file system of its own at a folder, until the end of the block."""
 
     def __init__(self, folder: Path, mib: int) -> None:
@@ -35,8 +33,5 @@ class SmallVolume:
     def close(self) -> None:
         subprocess.run(["umount", "--lazy", str(self.folder)], check=False, capture_output=True)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -32,6 +32,17 @@ class Service:
         return reply.error
 
 
+def with_fields(message, **values):
+    """Return the message after its fields were set; a list has all elements of a field."""
+    for name, value in values.items():
+        if isinstance(value, list):
+            message.ClearField(name)
+            getattr(message, name).extend(value)
+        else:
+            setattr(message, name, value)
+    return message
+
+
 class ServiceClient:
     """A client of such a service, with one robot's backup plan."""
 

@@ -31,19 +31,18 @@ def changed(data, **parts):
     return replace(data, trajectories=(replace(data.trajectories[0], **parts), *data.trajectories[1:]))
 
 
-def turning(samples, turn=0.3, speed=0.1):
-    """Return one period of an even turn at an even speed, in `samples` samples."""
-    at = np.arange(1, samples + 1) / samples
-    radius = speed / turn
+def turning(samples, turn=0.3):
+    """Return one period of 0.1 m with an even turn, in `samples` samples."""
+    at, radius = np.arange(1, samples + 1) / samples, 0.1 / turn
     path = np.column_stack([radius * np.sin(at * turn), radius * (1.0 - np.cos(at * turn))])
     states = np.zeros((2, 5))
     states[1, :3] = *path[-1], turn
     return Trajectory(states, np.zeros((1, 2)), path[None], np.array([turn]), None, (at * turn)[None])
 
 
-def with_value(array, value, at=(3, 0)):
+def with_value(array, value):
     array = array.copy()
-    array[at[: array.ndim]] = value
+    array[(3, 0)[: array.ndim]] = value
     return array
 
 

@@ -7,8 +7,6 @@ from brakeline.safety.filter.batch.dual_active_set import solve_batch
 from brakeline.safety.filter.qp_solver import SOLVED, solve
 from tests.safety.test_qp_solver import crowded
 
-# --- the solver of a batch of QPs -----------------------------------------------------------------------------------
-
 
 def test_the_solver_solves_exactly_or_proves_that_there_is_no_solution_whatever_rows_it_guesses():
     programs = [crowded(np.random.default_rng(seed)) for seed in range(150)]

@@ -1,5 +1,6 @@
 """The three error bounds: published sets, known noise, and the relations between them."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import product
 
@@ -93,9 +94,10 @@ def test_published_reachable_set_of_the_five_dimensional_system():
     A, half = np.array(truth["A"]), np.array(truth["e_half"])
     step = ErrorBound(A, np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)), half, np.eye(n))
     how = RecursionMaps(tuple(range(n)), 0, 0, np.zeros((0, 0)), np.eye(n))
-    tube = stack_recursive([step] * k, how, n, initial=truth["x0_half"] * np.eye(n))
-    start = np.array(truth["x0_center"], float)
-    center, width = tube.centers(start)[-1], tube.half_widths(start)[-1]
+    start = replace(step, C=np.eye(n), w=np.ones(n), generators=truth["x0_half"] * np.eye(n))  # leads to the first set
+    tube = stack_recursive([start, *[step] * k], how, n)
+    middle = np.array(truth["x0_center"], float)
+    center, width = tube.centers(middle)[-1], tube.half_widths(middle)[-1]
     assert np.allclose(center - width, truth["lo"], atol=1e-8)
     assert np.allclose(center + width, truth["hi"], atol=1e-8)
 

@@ -21,7 +21,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.service.client import query_service, read_reply, request_message
 from brakeline.safety.service.filter_client import accept
 from brakeline.safety.service.wire import digest, request_of
-from tests.safety.served import Service
+from tests.safety.served import Service, with_fields
 
 NUMBERS = (nan, inf, -inf)
 # What these fields may not hold, beside what their types say.
@@ -127,11 +127,8 @@ def changed(reply: pb.Reply, path: str, value: Any) -> pb.Reply:
         message.ClearField(name)
     elif isinstance(value, tuple):
         getattr(message, name)[value[0]] = value[1]
-    elif isinstance(value, list):
-        message.ClearField(name)
-        getattr(message, name).extend(value)
     else:
-        setattr(message, name, value)
+        with_fields(message, **{name: value})
     return reply
 
 

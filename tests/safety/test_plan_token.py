@@ -21,7 +21,7 @@ from brakeline.safety.service.plan_token import SIZE, PlanAuthenticator, write_k
 from brakeline.safety.service.wire import decision_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
-from tests.safety.served import Service
+from tests.safety.served import Service, with_fields
 
 KEY = bytes(range(32))
 WALL = Obstacle("cylinder", (0.24, 0.0), (0.1,))  # so near that nothing but a stop could be verified before it
@@ -71,13 +71,7 @@ FORGERIES = {
 def test_a_forged_request_does_not_count_as_verified(model: ModelSet, changes: dict[str, object]) -> None:
     """In front of a wall, where no new plan can be verified."""
     service = Service(model, key=KEY)
-    request = driving(service)
-    for name, value in changes.items():
-        if isinstance(value, list):
-            request.ClearField(name)
-            getattr(request, name).extend(value)
-        else:
-            setattr(request, name, value)
+    request = with_fields(driving(service), **changes)
     decision = service.decision(request)
     assert (decision.kind, decision.verified, decision.token_rejected) == (pb.FAILSAFE, False, True)
     assert not decision.plan_tokens, "an unverified plan gets no token"

@@ -35,9 +35,9 @@ def random_certificate(rng, n, nz, g, rows):
     )
 
 
-def slow_recursion(steps, z_of, y_0, initial, horizon):
+def slow_recursion(steps, z_of, y_0, horizon):
     """Lemma 2 with explicit zonotopes: every step's generators from the whole set of regressors, one at a time."""
-    center, generators, sets = y_0, list(initial.T), []
+    center, generators, sets = y_0, [], []
     for k in range(horizon):
         step, n = steps[k], len(y_0)
         regressor = z_of(center, k)
@@ -61,13 +61,12 @@ def test_the_recursion_is_the_explicit_one(seed):
     rng = np.random.default_rng(seed)
     n, m, horizon = 2, 1, 4
     steps = [random_certificate(rng, n, n + 2 * m, g=3, rows=5) for _ in range(horizon)]
-    initial = 0.2 * rng.normal(size=(n, 2))
     first = np.hstack([np.eye(n), np.zeros((n, m + horizon * m))])
     how = RecursionMaps((0, 1), 0, m, np.eye(horizon), first)
-    tube = stack_recursive(steps, how, n, initial=initial)
+    tube = stack_recursive(steps, how, n)
     y_0, u_prev, plan = rng.normal(size=n), rng.normal(size=m), rng.normal(size=horizon)
     inputs = np.concatenate([u_prev, plan])
-    sets = slow_recursion(steps, lambda y, k: np.concatenate([y, inputs[k : k + 2]]), y_0, initial, horizon)
+    sets = slow_recursion(steps, lambda y, k: np.concatenate([y, inputs[k : k + 2]]), y_0, horizon)
     z = np.concatenate([y_0, u_prev, plan])
     directions = rng.normal(size=(30, n))
     sizes = tube.magnitudes(z)[: tube.generators]

@@ -38,12 +38,12 @@ def scene(rng, count=6):
     return distances
 
 
-def taken(rng, obstacles, drop=0.0, noise=0.0, pose=(0.0, 0.0, 0.0), **more):
-    """A scan of these at the pose, by a sensor at the robot's middle; some beams say nothing."""
-    ranges = cast(obstacles, np.array(pose[:2]), FAN + pose[2])
+def taken(rng, obstacles, drop=0.0, noise=0.0, **more):
+    """A scan of these from the origin, by a sensor at the robot's middle; some beams say nothing."""
+    ranges = cast(obstacles, np.zeros(2), FAN)
     ranges = np.where(ranges < FAR, np.clip(ranges + rng.uniform(-noise, noise, len(ranges)), 1e-3, FAR), FAR)
     ranges[rng.random(len(ranges)) < drop] = 0.0
-    return Scan(ranges, FAN, pose, far=FAR, range_error=noise, least_width=WIDTH, **more)
+    return Scan(ranges, FAN, (0.0, 0.0, 0.0), far=FAR, range_error=noise, least_width=WIDTH, **more)
 
 
 @settings(max_examples=60, deadline=None)

@@ -207,10 +207,10 @@ def test_no_group_is_tracked_across_a_missing_scan_or_with_doubted_beams(missing
     assert bool((np.abs(tracks.motions[:, :2]).max(axis=1) > 0.4).any()) is followed
 
 
-def followed(world, scans=4, seed=0):
+def followed(world):
     """Return the last scan of a world that changes with time, from a standing sensor."""
-    memory, rng = FanMemory(GROUND.footprint), np.random.default_rng(seed)
-    for k in range(scans):
+    memory, rng = FanMemory(GROUND.footprint), np.random.default_rng(0)
+    for k in range(4):
         scan = memory.fill(taken(world(k * DT), np.zeros(2), rng), DT)
     return scan
 

@@ -5,6 +5,7 @@ import re
 import time
 from contextlib import suppress
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from brakeline.safety.service.client import SafetyClient, query_service, read_re
 from brakeline.safety.service.wire import MAX_BATCH_SIZE
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
-from tests.safety.served import Service
+from tests.safety.served import Service, with_fields
 
 NAN, INF = float("nan"), float("inf")
 AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
@@ -60,14 +61,7 @@ def test_a_standing_robot_with_widened_sets_reserves_as_much_as_they_take(servic
 
 
 def bad(**changes):
-    message = good()
-    for name, value in changes.items():
-        if isinstance(value, str | float):
-            setattr(message, name, value)
-        else:
-            message.ClearField(name)
-            getattr(message, name).extend(value)
-    return message
+    return with_fields(good(), **changes)
 
 
 def with_obstacle(**changes):
@@ -237,24 +231,19 @@ def test_violations_and_unverified_decisions_are_counted(service, caplog):
 # --- replies that the client refuses ----------------------------------------------------------------------------------
 
 
-def test_the_client_refuses_a_bad_reply(service):
+def test_the_client_names_the_field_of_a_bad_reply(service):
+    """`test_malformed_replies.py` has all values that it refuses."""
     reply = service.replies(good())[0]
     for change, field in (
         (lambda d: d.plan.append(0.0), "plan"),
         (lambda d: d.plan.__setitem__(0, 3.0), "plan"),
-        (lambda d: d.plan.__setitem__(1, NAN), "plan"),
         (lambda d: d.plan.__setitem__(4, 0.1), "plan"),
         (lambda d: setattr(d, "kind", pb.UNKNOWN), "kind"),
         (lambda d: d.predicted_center.pop(), "predicted_center"),
         (lambda d: d.predicted_center.__setitem__(0, INF), "predicted_center"),
-        (lambda d: d.predicted_half_width.__setitem__(0, NAN), "predicted_center"),
-        (lambda d: d.predicted_half_width.__setitem__(0, -0.1), "predicted_center"),
-        (lambda d: setattr(d, "margin", NAN), "predicted_center"),
         (lambda d: d.tube_center.pop(), "tube_center"),
         (lambda d: d.tube_half_width.__setitem__(0, INF), "tube_center"),
-        (lambda d: d.tube_half_width.__setitem__(0, -0.1), "tube_center"),
         (lambda d: setattr(d, "model", ""), "model"),
-        (lambda d: setattr(d, "model", UNVERIFIED), "model"),
         (lambda d: setattr(d, "kind", pb.RECOVERING), "kind"),
     ):
         damaged = pb.Reply()
@@ -263,35 +252,30 @@ def test_the_client_refuses_a_bad_reply(service):
         with pytest.raises(SafetyError) as caught:
             read_reply(damaged, good(), GROUND)
         assert caught.value.field == field
-    with pytest.raises(SafetyError):
-        read_reply(pb.Reply(), good(), GROUND)
     for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString(), b""):
         with pytest.raises(SafetyError, match="BadReply"):
-            query_service(FakeBus(answer), [good()], 0.1)
+            query_service(answering(answer), [good()], 0.1)
 
 
-class FakeBus:
-    def __init__(self, answer):
-        self.answer = answer
-
-    def ask(self, topic, payload, timeout, **names):
-        return self.answer
+def answering(answer):
+    """Return a bus that gives the same answer to everything."""
+    return SimpleNamespace(ask=lambda *_, **__: answer)
 
 
 def test_a_replayed_reply_is_refused(service):
     """Even for an equal request: each batch has a nonce, and the reply names the digest of its batch."""
     recorded = []
 
-    class Recording(FakeBus):
+    class Recording:
         def ask(self, topic, payload, timeout, **names):
             recorded.append(service.answer(payload))
             return recorded[-1]
 
-    assert read_reply(query_service(Recording(b""), [good()], 0.1)[0], good(), GROUND).verified
+    assert read_reply(query_service(Recording(), [good()], 0.1)[0], good(), GROUND).verified
     elsewhere = request_message(BackupPlan(GROUND), np.ones(5) * 0.1, [0.2, 0.1], [AHEAD])
     for question in (good(), elsewhere):
         with pytest.raises(SafetyError) as caught:
-            query_service(FakeBus(recorded[0]), [question], 0.1)
+            query_service(answering(recorded[0]), [question], 0.1)
         assert caught.value.field == "request"
 
 

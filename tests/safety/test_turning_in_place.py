@@ -87,10 +87,10 @@ def turner(driving):
     return fitted(driving)
 
 
-def pillars(gap, count, radius=0.1, body=0.15):
-    away = body + gap + radius
+def pillars(gap, count, body=0.15):
+    away = body + gap + 0.1
     angles = np.pi / 2 + 2 * np.pi * np.arange(count) / count
-    return [cylinder(away * np.cos(a), away * np.sin(a), radius) for a in angles]
+    return [cylinder(away * np.cos(a), away * np.sin(a), 0.1) for a in angles]
 
 
 def turn(ready, obstacles, rate, noise=0.0, steps=80, sides=(-1.0, 1.0)):

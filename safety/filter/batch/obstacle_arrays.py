@@ -178,7 +178,7 @@ def towards(xp: Any, near: NearObstacles, points: Axes) -> tuple[Axes, Array]:
     """
     d = len(points)
     away = [points[j][:, None] - near.center[j] for j in range(d)]
-    rest, square = [], None
+    rest = []
     for i in range(d):
         local = _summed([away[j] * near.axes[j][i] for j in range(d)])
         rest.append(local - xp.minimum(xp.maximum(local, -near.half[i]), near.half[i]))
@@ -190,7 +190,4 @@ def towards(xp: Any, near: NearObstacles, points: Axes) -> tuple[Axes, Array]:
 
 
 def _summed(parts: list[Array]) -> Array:
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
+    return sum(parts[1:], parts[0])

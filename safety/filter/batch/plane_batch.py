@@ -95,8 +95,7 @@ class EndBatch:
         end, period, directions, columns, extra = ends
         self._xp = xp
         self.count = len(end)
-        # end, period (E,): see `halfspace_kernels`
-        self.end, self.period, self.extra = constant(end), constant(period), constant(extra)
+        self.period, self.extra = constant(period), constant(extra)  # (E,): see `halfspace_kernels`
         self.columns = [constant(np.ascontiguousarray(columns[:, k])) for k in range(columns.shape[1])]
         d = directions.shape[1]
         used = range(len(self.columns))

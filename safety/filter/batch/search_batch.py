@@ -59,13 +59,12 @@ class SearchBatch:
     """Searches with the matrices of a filter, in a namespace and on a device."""
 
     def __init__(self, safety: Filter, constant: Any, xp: Any) -> None:
-        self._xp, self._inputs = xp, safety.inputs
+        self._xp, inputs = xp, safety.inputs
         self.constraints = ConstraintBatch(safety.constraints, constant, xp)
         self._qp = QPBatch(safety.builder, self.constraints, constant, xp)
         self._clearance, self._tightening = safety.clearance_margin, safety.builder.tightening
         self.known, self._free, self._m = safety.builder.known, safety.builder.free, safety.robot.action_dim
         self._one_input = self._free == self._m
-        inputs = safety.inputs
         self._low, self._high = constant(inputs.low[:, None]), constant(inputs.high[:, None])
         self._width = constant(inputs.width[:, None])
         self._slew, self._nothing = constant(inputs.slew[:, None]), constant(inputs.nothing[:, None])

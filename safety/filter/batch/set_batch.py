@@ -19,7 +19,7 @@ class SetBatch:
         self.constraints = constraints
         robot, nz, first = model.robot, tube.position.shape[2], model.first
         n = robot.state_dim
-        self._xp, self._d, self._heading = xp, robot.position_dim, robot.heading
+        self._xp, self._d = xp, robot.position_dim
         self._regressor = constant(model.first_regressor(np.eye(nz)).T)
         self._C, self._W, self._M = constant(first.C[:n]), constant(first.W), constant(first.M)
         self._kappa, self._w = constant(first.kappa), constant(first.w[:, None])
