@@ -17,8 +17,9 @@ from brakeline.messaging.scan import BeamTracks, Scan
 from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import patch_free_ranges
-from tests.messaging.test_obstacle import cast, sample
+from tests.messaging.test_obstacle import sample
 from tests.robots import QUADROTOR
+from tests.safety.ray_casting import cast
 
 RINGS, COLUMNS, FAR, WIDTH = 45, 90, 8.0, 0.6  # every 4°
 EDGE = 0.5 * math.pi * (1.0 - 1.0 / RINGS)
