@@ -118,6 +118,11 @@ class Page:
         self.call("Page.navigate", url=url)
         self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
 
+    def show(self, report: Path) -> None:
+        """Open a report, and wait until it is drawn."""
+        self.open(report.as_uri())
+        self.until("document.documentElement.dataset.drawn === 'yes'")
+
     def value(self, expression: str) -> Any:
         """What a JavaScript expression comes to."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
@@ -150,8 +155,7 @@ def drawn(report: Path, folder: Path) -> Iterator[Page]:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium: the report was not driven in a browser")
     with Page(folder) as page:
-        page.open(report.as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
+        page.show(report)
         yield page
 
 

@@ -21,7 +21,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from tests.browser import Page
-from tests.logs.conftest import Say, show, watched
+from tests.logs.conftest import Say, watched
 from tests.logs.sample_log import Writer
 from tests.logs.test_foxglove import Studio, episode, step
 from tests.robots import GROUND, QUADROTOR
@@ -127,7 +127,7 @@ def test_browsers_draw_the_perceived_surroundings(
     board, analysis = drive
     path = tmp_path / "report.html"
     write(path, analysis.figures(), analysis.by_label())
-    show(tab, path)
+    tab.show(path)
     tab.value("document.querySelector('#picker [data-view=above]').click()")
     marks = ("free", "hit", "mover", "swept", "reservation")
     shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in marks}
