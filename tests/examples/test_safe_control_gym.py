@@ -26,7 +26,7 @@ def after_period(state, force, steps=50):
     return state
 
 
-def test_the_description_has_the_constraints_of_the_environment(capsys):
+def test_the_description_has_the_constraints_of_the_environment():
     assert brakeline(["robot", "check", str(FOLDER / "cartpole.toml")]) == 0
     assert ROBOT.limit_scales == pytest.approx([2.0, 2.0, 2.0, 2.0, 0.18, 0.18, 2.0, 2.0])
     assert pytest.approx(1.0 / 15.0) == ROBOT.period

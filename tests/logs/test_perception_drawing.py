@@ -71,7 +71,7 @@ def test_foxglove_draws_the_perceived_surroundings(say: Say) -> None:
     assert shown.texts[0].color.r == pytest.approx(142 / 255), "recovering is violet"
 
 
-def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Say) -> None:
+def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up() -> None:
     """Drawing all 16,200 points took half a second: the recorder fell behind and lost the end of a flight."""
     ranges = np.full((90, 180), 5.0)
     edge = 0.5 * np.pi * (1.0 - 1.0 / 90)

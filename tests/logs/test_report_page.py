@@ -81,7 +81,7 @@ def test_it_needs_no_network_and_no_other_file(report: Report) -> None:
     assert len(text) < 3_000_000
 
 
-def test_it_loads_without_a_complaint_or_a_request(page: Page, report: Report) -> None:
+def test_it_loads_without_a_complaint_or_a_request(page: Page) -> None:
     assert page.complaints == []
     assert [url for url in page.requests if not url.startswith(("file:", "data:"))] == []
     assert page.value("document.title") == "Brakeline: <b>mixed"

@@ -50,9 +50,9 @@ def taken(rng, obstacles, noise=0.0, at=(0.0, 0.0, 0.0), **more):
     return RangeImage(noisy, at, low=-EDGE, high=EDGE, **more)
 
 
-def solid(obstacles, rng, within=FAR):
+def solid(obstacles, rng):
     points = np.concatenate([sample(obstacle, rng, 3000) for obstacle in obstacles])
-    return points[np.linalg.norm(points, axis=1) < within]
+    return points[np.linalg.norm(points, axis=1) < FAR]
 
 
 def free_towards(image, points):

@@ -16,14 +16,14 @@ EPISODES = 200
 HOUR = 3600.0
 
 
-def returns(policy: str, episodes: int = EPISODES) -> np.ndarray[Any, np.dtype[np.float64]]:
+def returns(policy: str) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return the rewards of fresh episodes behind the filter."""
     found: list[float] = []
 
     def each(tally: EpisodeStats) -> None:
         found.append(tally.returns[-1])
 
-    evaluate(GROUND, Evaluation(policy=policy, episodes=episodes), each)
+    evaluate(GROUND, Evaluation(policy=policy, episodes=EPISODES), each)
     return np.array(found)
 
 

@@ -321,7 +321,7 @@ def test_transforms_can_replace_odometry():
     assert inputs.state(0.5, 0.58) == pytest.approx([0.1, 0.0, 0.0, 0.2, 0.0], abs=1e-6)
 
 
-def test_a_clock_that_was_set_reports_the_jump_once(monkeypatch):
+def test_a_clock_that_was_set_reports_the_jump_once():
     simulated = RosSimulatedClock()
     for stamp in (100.0, 99.9, 101.0):
         simulated.on_clock(cdr.Clock(clock=cdr.time_of(stamp)))
