@@ -92,14 +92,8 @@ class Metrics:
         late: the steps that count since the last message of a learner, because it permitted them.
     """
 
-    def __init__(self, topics: Iterable[Topic] = RECORDED, robots: RecordedRobots | None = None) -> None:
-        """Create empty statistics.
-
-        Args:
-            topics: the topics whose messages are all added. For these, a message that a process has published and that
-                was not added counts as missing.
-            robots: the robots that messages name.
-        """
+    def __init__(self, robots: RecordedRobots | None = None) -> None:
+        """Create empty statistics; robots: those that messages name."""
         self._robots = robots or RecordedRobots()
         self.actors: dict[str, EpisodeStats] = {}
         self.decisions: dict[str, DecisionStats] = {}
@@ -114,7 +108,6 @@ class Metrics:
         self.late: list[pb.Step] = []
         self._now = 0  # ns, when the message in hand was received
         self._tube_stats = partial(TubeStats, self._robots)
-        self._topics = set(topics)
         self._handlers: dict[type[Message], Callable[[Any], None]] = {
             pb.Step: self._step,
             pb.Exchange: self._exchange,
@@ -239,7 +232,7 @@ class Metrics:
             place = key, health.header.run
             if topic_of(key) is LOGGED and (place in self.fed or len(self.fed) < MOST_STREAMS):
                 self.fed[place] = max(self.fed.get(place, 0), count)
-            if count and topic_of(key) in self._topics:
+            if count and topic_of(key) in RECORDED:  # a message of these that was not added is missing
                 stream = self.streams.get(place) or self._new_stream(place)
                 stream.published = max(stream.published, count)
 

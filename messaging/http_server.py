@@ -166,12 +166,18 @@ class BoundedHandler(BaseHTTPRequestHandler):
         return not reason
 
     def reply_text(self, status: int, text: str) -> None:
-        body = text.encode(errors="replace")
-        self.send_response(status)
-        self.send_header("Content-Type", "text/plain; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
+        self.reply(status, {"Content-Type": "text/plain; charset=utf-8"}, text.encode(errors="replace"))
+
+    def reply(self, status: int, headers: dict[str, str], body: bytes) -> None:
+        self.begin_reply(status, headers | {"Content-Length": str(len(body))})
         self.wfile.write(body)
+
+    def begin_reply(self, status: int, headers: dict[str, str]) -> None:
+        """Send the status and the headers."""
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log no requests."""

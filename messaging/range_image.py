@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
 from brakeline.messaging.scan import check_numbers, check_unit
-from brakeline.messaging.value_equality import same_values
+from brakeline.messaging.value_equality import ComparedByValue
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ MAX_ANGLE_ERROR = 0.3  # [rad]; with a larger error an image shows no free space
 
 
 @dataclass(frozen=True, eq=False)
-class RangeImage:
+class RangeImage(ComparedByValue):
     """A range image with E rings and A columns.
 
     Ring i has the elevation `low + i (high - low) / (E - 1)`, column j the azimuth `2π j / A`, from straight ahead to
@@ -72,9 +72,6 @@ class RangeImage:
     doubt: int = 0
     speed: float = 0.0
     age: float = 0.0
-
-    def __eq__(self, other: object) -> bool:
-        return same_values(self, other)
 
     def __hash__(self) -> int:
         return hash((self.ranges.shape, self.far, self.age))

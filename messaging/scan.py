@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import FARTHEST, Array
-from brakeline.messaging.value_equality import same_values
+from brakeline.messaging.value_equality import ComparedByValue
 
 MAX_BEAMS = 1000
 MAX_FAR = 1000.0  # largest range of a sensor [m]: a larger one is in mm
@@ -60,7 +60,7 @@ def check_numbers(
 
 
 @dataclass(frozen=True, eq=False)
-class BeamTracks:
+class BeamTracks(ComparedByValue):
     """The tracked motion of the surfaces that a scan hit (`safety/perception/scan_tracking.py`)."""
 
     # (R,) for each beam, the row in `motions` of the surface that it hit, counted from 1. 0: the surface is not tracked
@@ -69,9 +69,6 @@ class BeamTracks:
     # (K, 4) velocity x, y in the world [m/s], its error [m/s], and the largest acceleration [m/s²]. t seconds after the
     # scan the displacement is velocity·t, within error·t + acceleration·t²/2.
     motions: Array
-
-    def __eq__(self, other: object) -> bool:
-        return same_values(self, other)
 
     def __hash__(self) -> int:
         return hash(self.motions.shape)
@@ -90,7 +87,7 @@ class BeamTracks:
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class Scan(ComparedByValue):
     """A scan in the plane with R beams.
 
     No obstacle is narrower than `least_width`: from each point of an obstacle's surface, two edges of that length at a
@@ -134,9 +131,6 @@ class Scan:
     acceleration: float = 0.0
     least_radius: float = 0.0
     tracks: BeamTracks | None = None
-
-    def __eq__(self, other: object) -> bool:
-        return same_values(self, other)
 
     def __hash__(self) -> int:
         return hash((self.ranges.shape, self.far, self.age))

@@ -18,7 +18,7 @@ MAX_RANGE_STEPS = 65_535
 # Fields that have the same name and form in the class and in the message.
 SHARED_FIELDS = ("far", "range_error", "position_error", "least_width", "doubt", "speed", "age")
 SCAN_FIELDS = (*SHARED_FIELDS, "heading_error", "acceleration", "least_radius")
-IMAGE_FIELDS = (*SHARED_FIELDS, "angle_error", "low", "high")
+IMAGE_FIELDS = (*SHARED_FIELDS, "at", "attitude", "mount", "angle_error", "low", "high")
 
 
 def _values(source: Any, names: tuple[str, ...]) -> dict[str, Any]:
@@ -62,20 +62,19 @@ def scan_message(scan: Scan) -> pb.Scan:
 
 def scan_of(message: pb.Scan) -> Scan:
     """Return the scan in a message. Raises BadScan: the scan is invalid."""
-    if len(message.pose) != 3 or len(message.mount) != 2:
-        raise BadScan("a scan's pose has 3 coordinates, its mount 2")
     if len(message.ways) % 4:
         raise BadScan("a scan's ways have four numbers each")
     tracks = None
     if message.which:
         motions = np.array(message.ways, dtype=float).reshape(-1, 4)
         tracks = BeamTracks(np.frombuffer(message.which, np.uint8), motions)
-    x, y, heading = message.pose
+    pose: Any = tuple(message.pose)  # `Scan` checks the lengths
+    mount: Any = tuple(message.mount)
     return Scan(
         np.fromiter(message.ranges, np.float64, len(message.ranges)),  # five times as fast as `np.array`
         np.fromiter(message.angles, np.float64, len(message.angles)),
-        (x, y, heading),
-        (message.mount[0], message.mount[1]),
+        pose,
+        mount,
         tracks=tracks,
         **_values(message, SCAN_FIELDS),
     )
@@ -87,24 +86,13 @@ def image_message(image: RangeImage) -> pb.RangeImage:
     return pb.RangeImage(
         ranges=ranges.tobytes(),
         rings=len(ranges),
-        at=image.at,
-        attitude=image.attitude,
-        mount=image.mount,
         **_values(image, IMAGE_FIELDS),
     )
 
 
 def image_of(message: pb.RangeImage) -> RangeImage:
     """Return the range image in a message. Raises BadScan: the image is invalid."""
-    if (len(message.at), len(message.attitude), len(message.mount)) != (3, 4, 3):
-        raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
     if not message.rings or not message.ranges or len(message.ranges) % (2 * message.rings):
         raise BadScan("a range image has two bytes for each beam, and as many beams in every ring")
-    w, x, y, z = message.attitude
-    return RangeImage(
-        np.frombuffer(message.ranges, "<u2").reshape(message.rings, -1) * RANGE_STEP,
-        (message.at[0], message.at[1], message.at[2]),
-        (w, x, y, z),
-        mount=(message.mount[0], message.mount[1], message.mount[2]),
-        **_values(message, IMAGE_FIELDS),
-    )
+    ranges = np.frombuffer(message.ranges, "<u2").reshape(message.rings, -1) * RANGE_STEP
+    return RangeImage(ranges, **_values(message, IMAGE_FIELDS))

@@ -29,4 +29,4 @@ class ComparedByValue:
     def __eq__(self, other: object) -> bool:
         return same_values(self, other)
 
-    __hash__ = None  # type: ignore[assignment]  # as of every dataclass that is compared and holds arrays
+    __hash__: Any = None  # as of every dataclass that is compared and holds arrays

@@ -27,6 +27,7 @@ FLAGS = (
     "--disable-background-networking",
     "--no-first-run",
     "--hide-scrollbars",
+    "--window-size=1280,900",
     "--remote-debugging-port=0",
 )
 
@@ -37,8 +38,8 @@ class Page:
     `requests` are the addresses it asked for, `complaints` its exceptions and the errors on its console.
     """
 
-    def __init__(self, folder: Path, width: int = 1280, height: int = 900) -> None:
-        self._folder, self._size = folder, (width, height)
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self.requests: list[str] = []
         self.complaints: list[str] = []
         self._number, self._session = 0, ""
@@ -54,8 +55,7 @@ class Page:
 
     def _start(self, stack: ExitStack) -> None:
         assert CHROMIUM is not None
-        size = f"--window-size={self._size[0]},{self._size[1]}"
-        words = [CHROMIUM, *FLAGS, size, f"--user-data-dir={self._folder}", "about:blank"]
+        words = [CHROMIUM, *FLAGS, f"--user-data-dir={self._folder}", "about:blank"]
         process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         stack.callback(_end, process)
         address = self._folder / "DevToolsActivePort"
@@ -72,7 +72,7 @@ class Page:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        self.size(*self._size)
+        self.size(1280, 900)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """The result of one command of the protocol; what else comes meanwhile is taken note of."""
@@ -118,6 +118,11 @@ class Page:
         self.call("Page.navigate", url=url)
         self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
 
+    def show(self, report: Path) -> None:
+        """Open a report, and wait until it is drawn."""
+        self.open(report.as_uri())
+        self.until("document.documentElement.dataset.drawn === 'yes'")
+
     def value(self, expression: str) -> Any:
         """What a JavaScript expression comes to."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
@@ -150,8 +155,7 @@ def drawn(report: Path, folder: Path) -> Iterator[Page]:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium: the report was not driven in a browser")
     with Page(folder) as page:
-        page.open(report.as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
+        page.show(report)
         yield page
 
 

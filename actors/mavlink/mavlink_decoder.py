@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -91,7 +91,7 @@ class MavlinkDecoder:
         self._types: dict[str, int] = {}  # MAV_PARAM_TYPE of each of them
         self._resets: int | None = None  # of the estimate, by ODOMETRY
         self._tap, self._say = tap, say
-        self._mav = mavlink.MAVLink(_Pipe(send), srcSystem=STATION, srcComponent=COMPONENT)
+        self._mav = mavlink.MAVLink(SimpleNamespace(write=send), srcSystem=STATION, srcComponent=COMPONENT)
         self._mav.robust_parsing = True
         if tap is not None:
             self._mav.set_send_callback(lambda message: tap(CapturedFrame(True, bytes(message.get_msgbuf()), message)))
@@ -251,10 +251,3 @@ SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: the quantities in 
 for _what, _sources in SOURCES.items():
     for _place, _source in enumerate(_sources):
         SENDERS.setdefault(_source.message, []).append((_what, _place))
-
-
-@dataclass(frozen=True)
-class _Pipe:
-    """The part of a file that pymavlink uses."""
-
-    write: Callable[[bytes], object]

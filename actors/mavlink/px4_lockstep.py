@@ -62,11 +62,9 @@ class Px4Flight:
     field.
     """
 
-    def __init__(
-        self, folder: Path, noise: SensorNoise, parameters: dict[str, float] | None = None, tap: FrameTap | None = None
-    ) -> None:
-        """folder, parameters: see `Px4Process`; tap: called with every MAVLink frame between PX4 and this process."""
-        self._folder, self._noise, self._parameters, self._tap = folder, noise, parameters, tap
+    def __init__(self, folder: Path, noise: SensorNoise, tap: FrameTap | None = None) -> None:
+        """folder: see `Px4Process`; tap: called with every MAVLink frame between PX4 and this process."""
+        self._folder, self._noise, self._tap = folder, noise, tap
         self._px4: Px4Process | None = None
         self._count = 0
         self._times = dict.fromkeys(INTERVALS, 0.0)  # s, of the newest message of each kind
@@ -145,7 +143,7 @@ class Px4Flight:
         link.bind(("127.0.0.1", 0))
         link.setblocking(False)
         try:
-            self._px4 = px4 = Px4Process(self._folder, link.getsockname()[1], self._parameters)
+            self._px4 = px4 = Px4Process(self._folder, link.getsockname()[1])
         except BaseException:
             link.close()
             raise

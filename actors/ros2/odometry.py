@@ -76,19 +76,18 @@ class OdometryHistory:
         self._append(time, x, y, heading, speed, turn_rate)
         return True
 
-    def add_pose(self, time: float, x: float, y: float, heading: float) -> bool:
+    def add_pose(self, time: float, x: float, y: float, heading: float) -> None:
         """Add a pose without speeds, see `add`. The speeds come from the poses of the last `SPEED_WINDOW` seconds."""
         if not self._admit(time, x, y, heading):
-            return False
+            return
         past = next((row for row in reversed(self._rows) if row[TIME] <= time - SPEED_WINDOW), None)
         if past is None or time - past[TIME] > SPEED_WINDOW + self._gap:
             self._append(time, x, y, heading, math.nan, math.nan)
-            return True
+            return
         duration, turn = time - past[TIME], wrap(heading - past[HEADING])
         middle = past[HEADING] + 0.5 * turn
         distance = math.cos(middle) * (x - past[X]) + math.sin(middle) * (y - past[Y])
         self._append(time, x, y, heading, distance / duration, turn / duration)
-        return True
 
     def at(self, times: Array) -> Array | None:
         """Return the states (n, 5) at some times (n,) [s]; None if one of them is not covered, or in a gap."""

@@ -117,18 +117,17 @@ function nearestLine(lines, step, away) {
 /** Follow the pointer on a chart: move the line on all charts; a drag zooms, a click opens an episode. */
 function followPointer(box, stepAt, x, on) {
   const svg = box.querySelector("svg"), zooming = box.querySelector(".zooming");
-  const at = (event) => { const bounds = svg.getBoundingClientRect(), per = svg.viewBox.baseVal.width / bounds.width; return [(event.clientX - bounds.left) * per, (event.clientY - bounds.top) * per]; };
   let pressed = null;
-  svg.addEventListener("pointerdown", (event) => { if (event.button === 0) [pressed] = at(event); });
+  svg.addEventListener("pointerdown", (event) => { if (event.button === 0) [pressed] = pointIn(svg, event); });
   svg.addEventListener("pointermove", (event) => {
-    const [px] = at(event), step = stepAt(px);
+    const [px] = pointIn(svg, event), step = stepAt(px);
     on.cross(step);
     if (pressed === null) return;
     zooming.setAttribute("x", Math.min(x(stepAt(pressed)), x(step)));
     zooming.setAttribute("width", Math.abs(x(step) - x(stepAt(pressed))));
   });
   svg.addEventListener("pointerup", (event) => {
-    const [px, py] = at(event), begun = pressed;
+    const [px, py] = pointIn(svg, event), begun = pressed;
     pressed = null;
     zooming.setAttribute("width", 0);
     if (begun === null) return;

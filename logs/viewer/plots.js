@@ -32,8 +32,7 @@ function plotsOf(episode, k) {
 function pointAtClick(episode, event) {
   const svg = event.target.closest("svg");
   if (!svg?.dataset.left) return null;
-  const bounds = svg.getBoundingClientRect(), { left, right, begin, end } = svg.dataset;
-  const at = ((event.clientX - bounds.left) * svg.viewBox.baseVal.width) / bounds.width;
-  const time = +begin + ((at - left) / (right - left)) * (end - begin);
+  const { left, right, begin, end } = svg.dataset;
+  const time = +begin + ((pointIn(svg, event)[0] - left) / (right - left)) * (end - begin);
   return pointOf(episode, time / (episode.period ?? 1));
 }

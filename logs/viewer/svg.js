@@ -115,14 +115,18 @@ function nothing(text) {
 
 const tip = element("div", { id: "tip" });
 
+/** Return the place of the pointer, in units of a drawing. */
+function pointIn(svg, event) {
+  const bounds = svg.getBoundingClientRect(), per = svg.viewBox.baseVal.width / bounds.width;
+  return [(event.clientX - bounds.left) * per, (event.clientY - bounds.top) * per];
+}
+
 /** Show `text(x, y)` beside the pointer while it is over `target`; x and y in units of the drawing; null hides it. */
 function hovers(target, text) {
   const svg = target.querySelector("svg");
   const hide = () => { tip.style.display = "none"; };
   target.addEventListener("pointermove", (event) => {
-    const box = svg.getBoundingClientRect();
-    const per = svg.viewBox.baseVal.width / box.width;
-    const words = text((event.clientX - box.left) * per, (event.clientY - box.top) * per);
+    const words = text(...pointIn(svg, event));
     if (words === null) return hide();
     tip.textContent = words;
     tip.style.display = "block";

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.resources import files
@@ -147,12 +147,12 @@ class _Handler(BoundedHandler):
             if path == "/events":
                 self._events()
             elif path == "/view.json":
-                self._send(200, "application/json", encode(self._view()).encode())
+                self._send("application/json", encode(self._view()).encode())
             elif path == REPORT:
                 self._send_report()
             elif path in FILES:
                 name, kind = FILES[path]
-                self._send(200, kind, (files("brakeline.logs") / name).read_bytes())
+                self._send(kind, (files("brakeline.logs") / name).read_bytes())
             else:
                 self.reply_text(404, "not found; the page is at /\n")
         except (ConnectionError, TimeoutError):  # the client has disconnected
@@ -172,13 +172,10 @@ class _Handler(BoundedHandler):
                     words = f"no report: {error}. Try `brakeline analyse {self._report.folder} --html report.html`\n"
                     self.reply_text(500, words)
                 else:
-                    self._send(200, HTML, page, REPORT_HEADERS)
+                    self._send(HTML, page, REPORT_HEADERS)
 
-    def _send(self, status: int, kind: str, body: bytes, headers: Mapping[str, str] = HEADERS) -> None:
-        self._head(status, kind, headers)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
+    def _send(self, kind: str, body: bytes, headers: dict[str, str] = HEADERS) -> None:
+        self.reply(200, {"Content-Type": kind} | headers, body)
 
     def _events(self) -> None:
         """Send the view repeatedly until the client disconnects or the server stops."""
@@ -187,19 +184,11 @@ class _Handler(BoundedHandler):
             if not allowed:
                 self.reply_text(503, f"{MOST_STREAMS} pages are open already\n")
                 return
-            self._head(200, "text/event-stream")
-            self.send_header("Connection", "close")
-            self.end_headers()
+            self.begin_reply(200, {"Content-Type": "text/event-stream"} | HEADERS | {"Connection": "close"})
             while not self._ended.is_set():
                 self.wfile.write(b"data: " + encode(self._view()).encode() + b"\n\n")
                 self.wfile.flush()
                 time.sleep(1.0 / RATE)
-
-    def _head(self, status: int, kind: str, headers: Mapping[str, str] = HEADERS) -> None:
-        self.send_response(status)
-        self.send_header("Content-Type", kind)
-        for name, value in headers.items():
-            self.send_header(name, value)
 
 
 def encode(view: dict[str, Any]) -> str:

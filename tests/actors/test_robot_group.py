@@ -31,23 +31,20 @@ def fleet_of(size=SIZE, arena="crossing", reserving=True):
     return RobotGroup(runners, world, reserving)
 
 
-def policies(name, size=SIZE, seed=0):
-    return [scripted(name, GROUND, np.random.default_rng(seed + i)) for i in range(size)]
-
-
-def begin_close_together(fleet):
-    """Begin an episode with all robots on a small circle around a free position."""
+def close_fleet(reserving=True):
+    """Return robots that begin an episode on a small circle around a free position."""
+    fleet = fleet_of(reserving=reserving)
     fleet.begin(0)
     arena = fleet.world.world.robots[0].arena
     spots = np.random.default_rng(0).uniform(-1.5, 1.5, (2000, 2))
     spot = spots[np.argmax(arena.shapes.distance(spots).min(axis=0))]
-    size = len(fleet.runners)
     for i, robot in enumerate(fleet.world.world.robots):
-        angle = 2.0 * np.pi * i / size
+        angle = 2.0 * np.pi * i / SIZE
         robot._qpos[:2] = spot + 0.4 * np.array([np.cos(angle), np.sin(angle)])
         robot.start_estimation(None, np.random.default_rng(i))
         runner = fleet.runners[i]
         runner.info = runner.info | {"state": robot.measured, "others": fleet.world.other_states(i)}
+    return fleet
 
 
 def least_distance(fleet):
@@ -58,7 +55,8 @@ def least_distance(fleet):
 
 def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
     """Return the least distance of reservations [m] and the decisions; lost: probability that answers begin to fail."""
-    rng, proposers, least, kinds = np.random.default_rng(seed), policies(policy, len(fleet.runners), seed), np.inf, []
+    proposers = [scripted(policy, GROUND, np.random.default_rng(seed + i)) for i in range(len(fleet.runners))]
+    rng, least, kinds = np.random.default_rng(seed), np.inf, []
     silent = 0  # periods that the service is silent for
     for _ in range(periods):
         proposals = [policy(r.observation, r.info) for policy, r in zip(proposers, fleet.runners, strict=True)]
@@ -74,8 +72,7 @@ def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
 
 @pytest.mark.parametrize("policy", ["adversary", "random"])
 def test_no_robots_touch_and_reservations_stay_disjoint_though_answers_fail(ask, policy):
-    fleet = fleet_of()
-    begin_close_together(fleet)
+    fleet = close_fleet()
     least, kinds = drive(fleet, ask, policy, 100, lost=0.15)
     assert fleet.world.touches == 0
     assert least >= -ROUNDING
@@ -86,7 +83,7 @@ def test_robots_whose_reservations_touch_do_not_count_as_verified():
     """The service changes to wider sets and back, and the robots ask for wider sets: some get no verified plan."""
     narrow = ModelSet.load("ground")
     wide = replace(narrow, steps=tuple(replace(step, w=10.0 * step.w) for step in narrow.steps), in_place=None)
-    service, rng, reasons, fleet = Service(wide, narrow), np.random.default_rng(0), [], fleet_of()
+    service, rng, reasons, fleet = Service(wide, narrow), np.random.default_rng(0), [], close_fleet()
 
     def ask(requests):
         if rng.random() < 0.2:
@@ -101,22 +98,19 @@ def test_robots_whose_reservations_touch_do_not_count_as_verified():
                 assert not one.verified and not other.verified
         return replies
 
-    begin_close_together(fleet)
     drive(fleet, ask, "random", 100)
     assert fleet.world.touches == 0
     assert any("touches another robot's" in reason for reason in reasons)
 
 
 def test_without_reservations_the_same_robots_touch(ask):
-    fleet = fleet_of(reserving=False)
-    begin_close_together(fleet)
+    fleet = close_fleet(reserving=False)
     drive(fleet, ask, "adversary", 60)
     assert fleet.world.touches > 0
 
 
 def test_without_answers_all_robots_stop_within_their_reservations(ask):
-    fleet = fleet_of()
-    begin_close_together(fleet)
+    fleet = close_fleet()
     drive(fleet, ask, "random", 15)
     reservations = [runner.backup_plan.reservation for runner in fleet.runners]
     outcomes = request_decisions(no_answer, fleet.requests([np.zeros(2)] * SIZE), GROUND)
@@ -193,8 +187,7 @@ def test_a_moving_robot_without_a_reservation_is_refused(ask):
 
 def test_if_one_robot_has_no_answer_none_has(ask):
     """The other robots' new plans may rest on a plan that this robot does not know."""
-    fleet = fleet_of()
-    begin_close_together(fleet)
+    fleet = close_fleet()
     drive(fleet, ask, "random", 8)
 
     def garbled(requests):

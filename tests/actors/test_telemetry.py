@@ -70,13 +70,6 @@ MESSAGES: dict[str, Any] = {
 }
 
 
-POSITIONS: dict[str, Callable[[float], Any]] = {
-    "LOCAL_POSITION_NED": lambda now: mavlink.MAVLink_local_position_ned_message(
-        round(1e3 * now), 1.0, 2.0, 3.0, 0, 0, 0
-    )
-}  # with a time, since a position counts only if it is newer than the last one
-
-
 def position_at(now: float) -> Any:
     """Return a position with a time [s], since one that is not newer than the last one does not count."""
     return mavlink.MAVLink_local_position_ned_message(round(1e3 * now), 1.0, 2.0, 3.0, 0.0, 0.0, 0.0)

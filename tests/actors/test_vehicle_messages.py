@@ -31,6 +31,7 @@ from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import Period
+from tests.actors.test_flight_process import STANDING
 from tests.robots import GROUND, QUADROTOR
 
 LATE = QUADROTOR.in_real_time()
@@ -77,8 +78,7 @@ def test_a_control_period_survives_a_conversion(lost):
     ],
 )
 def test_an_invalid_control_period_is_refused(spoil):
-    report = Period(np.zeros(9), np.zeros(9), False, 1.0, 1.0, np.zeros((SAMPLES, 3)), 0.0)
-    message = period_message(ControlPeriod(1, np.zeros(3), report))
+    message = period_message(ControlPeriod(1, np.zeros(3), STANDING))
     period_of(message, LATE)
     spoil(message)
     with pytest.raises(BadMessage):

@@ -33,9 +33,8 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
-from brakeline.sim.quadrotor import SAMPLES
-from brakeline.sim.vehicle import Period
 from tests.actors.conftest import served
+from tests.actors.test_flight_process import STANDING
 from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until
@@ -246,8 +245,7 @@ def test_an_invalid_flight_request_gets_an_error_and_one_actor_at_a_time_is_serv
 def test_an_invalid_update_is_skipped_and_the_next_one_counts() -> None:
     """A server sends invalid messages and then falls silent: the actor gets an error and does not hang."""
     url, rejected = f"udpout:127.0.0.1:{os.getpid()}", RejectedMessages()
-    standing = Period(np.zeros(9), np.zeros(9), False, np.inf, np.inf, np.zeros((SAMPLES, 3)), 0.0)
-    good = period_message(ControlPeriod(3, np.zeros(3), standing))
+    good = period_message(ControlPeriod(3, np.zeros(3), STANDING))
     bad = [pb.ControlPeriod(), pb.ControlPeriod.FromString(good.SerializeToString())]
     bad[1].measured[4] = np.nan
 

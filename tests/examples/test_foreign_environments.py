@@ -2,10 +2,8 @@
 
 import dataclasses
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,23 +24,9 @@ from examples.foreign.distance_field import DistanceField
 from examples.foreign.run import missing_seeds
 from examples.foreign.trained import TrainedPolicy, mean_and_spread
 from tests.accepting import BOUND
+from tests.examples.programs import EXAMPLES, python_of, run_program
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 POINT = robot_named(str(EXAMPLES / "safety_gymnasium" / "point.toml"))
-
-
-def python_of(folder):
-    python = EXAMPLES / folder / ".venv" / "bin" / "python"
-    if not python.exists():
-        pytest.skip(f"{folder} has no virtual environment: make {folder.replace('_', '-')}")
-    return python
-
-
-def last_line(python, script, *words):
-    command, alone = [python, EXAMPLES / "foreign" / script, *words], os.environ | {"OMP_NUM_THREADS": "1"}
-    result = subprocess.run(command, check=False, capture_output=True, text=True, env=alone)
-    assert result.returncode == 0, result.stderr
-    return result.stdout.strip().splitlines()[-1]
 
 
 def test_a_client_and_a_recorder_need_no_solver_and_no_simulator():
@@ -65,15 +49,16 @@ def test_an_action_that_is_not_finite_reaches_the_filter():
 def test_behind_the_filter_driving_at_hazards_costs_nothing(tmp_path, robot, folder, periods):
     python = python_of(folder)
     record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
-    last_line(python, "collect.py", robot, str(record), str(periods))
+    run_program("foreign/collect.py", robot, record, periods, python=python, timeout=None)
     models = ModelRegistry(accept_bound=BOUND)
     models.install(certify(Dataset.load(record), ModelConfig())[0])
     endpoint = free_endpoint()
     words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
         bus.serve(DECIDE, BatchHandler(models, ServiceCounts()))
-        printed = last_line(python, "run.py", *words, "--connect", endpoint, "--out", str(lines))
-    figures = json.loads(printed)
+        words += ["--connect", endpoint, "--out", lines]
+        printed = run_program("foreign/run.py", *words, python=python, timeout=None)
+    figures = json.loads(printed.strip().splitlines()[-1])
     assert figures["cost"] == 0.0 and figures["steps"] == 300
     assert set(figures["decisions"]) <= {"allowed", "adjusted", "failsafe"} and figures["decisions"]["allowed"] < 270
     assert json.loads(lines.read_text()) == figures

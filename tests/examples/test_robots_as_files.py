@@ -36,8 +36,8 @@ from brakeline.sim.vehicle import Vehicle
 from tests.accepting import BOUND
 from tests.arenas import staged_arena
 from tests.deploy.drive import episode
+from tests.examples.programs import EXAMPLES
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("car", "omni")
 TRAJECTORIES = 20  # enough windows in both parts of the data
 

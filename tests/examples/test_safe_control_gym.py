@@ -1,9 +1,6 @@
 """examples/safe_control_gym: the velocity loop and the table; and, if the package is installed, a drive of its own."""
 
 import json
-import os
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +8,9 @@ import pytest
 from brakeline.deploy.cli import main as brakeline
 from examples.safe_control_gym import table
 from examples.safe_control_gym.velocity_loop import ROBOT, STRONGEST, force_of, velocity_of
+from tests.examples.programs import EXAMPLES, python_of, run_program
 
-FOLDER = Path(__file__).parents[2] / "examples" / "safe_control_gym"
+FOLDER = EXAMPLES / "safe_control_gym"
 CART, POLE, HALF, GRAVITY = 1.0, 0.1, 0.5, 9.8  # kg, kg, m (half the pole), m/s²
 
 
@@ -28,7 +26,7 @@ def after_period(state, force, steps=50):
     return state
 
 
-def test_the_description_has_the_constraints_of_the_environment(capsys):
+def test_the_description_has_the_constraints_of_the_environment():
     assert brakeline(["robot", "check", str(FOLDER / "cartpole.toml")]) == 0
     assert ROBOT.limit_scales == pytest.approx([2.0, 2.0, 2.0, 2.0, 0.18, 0.18, 2.0, 2.0])
     assert pytest.approx(1.0 / 15.0) == ROBOT.period
@@ -72,23 +70,19 @@ def test_the_table_counts_each_seed_once_and_states_exact_intervals(tmp_path, ca
 
 
 def test_no_policy_violates_a_constraint_behind_the_filter(tmp_path, monkeypatch):
-    python = FOLDER / ".venv" / "bin" / "python"
-    if not python.exists():
-        pytest.skip("safe_control_gym has no virtual environment: make safe-control-gym")
+    python = python_of(FOLDER.name)
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
 
-    def run(*words):
-        alone = os.environ | {"OMP_NUM_THREADS": "1"}
-        result = subprocess.run([python, *map(str, words)], capture_output=True, text=True, env=alone, check=False)
-        assert result.returncode == 0, result.stderr
-        return [json.loads(one) for one in result.stdout.splitlines() if one.startswith("{")]
+    def run(name, *words):
+        printed = run_program(f"{FOLDER.name}/{name}", *words, python=python, timeout=None)
+        return [json.loads(one) for one in printed.splitlines() if one.startswith("{")]
 
     robot, log, model = FOLDER / "cartpole.toml", tmp_path / "drive.csv", "cartpole/residual-one-step.safetensors"
-    run(FOLDER / "record.py", log, 5)
+    run("record.py", log, 5)
     assert brakeline(["import", str(log), "--robot", str(robot)]) == 0
     assert brakeline(["certify", str(robot), "--use", "--accept-bound", "0.1"]) == 0
     for policy, amplitude in (("ppo", 1.0), ("lqr", 2.3)):
-        words = [FOLDER / "run.py", policy, "--amplitude", amplitude, "--seeds", 0, 2]
+        words = ["run.py", policy, "--amplitude", amplitude, "--seeds", 0, 2]
         behind = run(*words[:2], "brakeline", *words[2:], "--model", tmp_path / model, "--accept-bound", 0.1)
         without = run(*words[:2], "none", *words[2:])
         assert [one["violations"] for one in behind] == [0, 0] and all(one["steps"] == 150 for one in behind)

@@ -100,12 +100,6 @@ def tab(browser: Page) -> Iterator[Page]:
     browser.size(1280, 900)
 
 
-def show(tab: Page, report: Path) -> None:
-    """Open a report, and wait until it is drawn."""
-    tab.open(report.as_uri())
-    tab.until("document.documentElement.dataset.drawn === 'yes'")
-
-
 @contextmanager
 def watched(tab: Page, server: LivePageServer) -> Iterator[None]:
     """Open the live page, and leave it again before its server ends."""

@@ -21,7 +21,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from tests.browser import Page
-from tests.logs.conftest import Say, show, watched
+from tests.logs.conftest import Say, watched
 from tests.logs.sample_log import Writer
 from tests.logs.test_foxglove import Studio, episode, step
 from tests.robots import GROUND, QUADROTOR
@@ -71,7 +71,7 @@ def test_foxglove_draws_the_perceived_surroundings(say: Say) -> None:
     assert shown.texts[0].color.r == pytest.approx(142 / 255), "recovering is violet"
 
 
-def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Say) -> None:
+def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up() -> None:
     """Drawing all 16,200 points took half a second: the recorder fell behind and lost the end of a flight."""
     ranges = np.full((90, 180), 5.0)
     edge = 0.5 * np.pi * (1.0 - 1.0 / 90)
@@ -127,7 +127,7 @@ def test_browsers_draw_the_perceived_surroundings(
     board, analysis = drive
     path = tmp_path / "report.html"
     write(path, analysis.figures(), analysis.by_label())
-    show(tab, path)
+    tab.show(path)
     tab.value("document.querySelector('#picker [data-view=above]').click()")
     marks = ("free", "hit", "mover", "swept", "reservation")
     shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in marks}

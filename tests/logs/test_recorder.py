@@ -189,7 +189,7 @@ def test_pictures_that_take_too_long_cost_no_message(
     assert recording.undrawn > 80 and caplog.text.count("without scenes") == 1
 
 
-def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path, say: Say) -> None:
+def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     recording = Recording(LogSettings(tmp_path / "file" / "run.mcap"), Inbox())
     recording.save()

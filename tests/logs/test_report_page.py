@@ -18,7 +18,6 @@ from brakeline.logs.report_page import embedded, number, percent, render, write
 from brakeline.logs.segment import open_segment
 from tests.browser import Page, drawn
 from tests.full_disk import full_disk
-from tests.logs.conftest import show
 from tests.logs.sample_log import ABOUT, mixed
 
 Report = tuple[Path, dict[str, Any]]
@@ -82,7 +81,7 @@ def test_it_needs_no_network_and_no_other_file(report: Report) -> None:
     assert len(text) < 3_000_000
 
 
-def test_it_loads_without_a_complaint_or_a_request(page: Page, report: Report) -> None:
+def test_it_loads_without_a_complaint_or_a_request(page: Page) -> None:
     assert page.complaints == []
     assert [url for url in page.requests if not url.startswith(("file:", "data:"))] == []
     assert page.value("document.title") == "Brakeline: <b>mixed"
@@ -353,7 +352,7 @@ def test_an_empty_log_has_a_page_too(tab: Page, tmp_path: Path) -> None:
     assert main(["analyse", str(tmp_path / "run.mcap"), "--html", str(tmp_path / "a" / "page.html"), "--json"]) == 0
     text = (tmp_path / "a" / "page.html").read_text()
     assert "alert(1)</script>" not in text
-    show(tab, tmp_path / "a" / "page.html")
+    tab.show(tmp_path / "a" / "page.html")
     assert tab.complaints == []
     assert tab.value("document.querySelectorAll('.none').length") == 6
 
@@ -393,7 +392,7 @@ def test_no_text_of_a_log_runs_as_a_script(tab: Page, tmp_path: Path, analysis: 
     bare = tmp_path / "bare.html"  # without its policy: the escaping alone must do
     bare.write_text(re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", path.read_text()))
     for place in (bare, path):
-        show(tab, place)
+        tab.show(place)
         assert tab.value("document.querySelectorAll('img, svg script, main script').length") == 0
         assert tab.value("document.title").startswith("Brakeline: ")
         assert tab.complaints == []
@@ -405,6 +404,6 @@ def test_its_policy_lets_no_script_or_style_run_but_its_own(tab: Page, report: R
     injected = tmp_path / "injected.html"
     tricks = "<script>document.title = 'owned'</script><img src='data:,' onerror=\"document.title = 'owned'\">"
     injected.write_text(report[0].read_text().replace("<main>", f"<main>{tricks}", 1))
-    show(tab, injected)
+    tab.show(injected)
     assert tab.value("document.title").startswith("Brakeline: ")
     assert any("Content Security Policy" in complaint for complaint in tab.complaints)

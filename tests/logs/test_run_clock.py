@@ -10,11 +10,11 @@ from brakeline.logs import segment
 from brakeline.logs.figure_tables import analyse
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.run_clock import RunClock
-from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import STEP
+from tests.logs.sample_log import written
 from tests.waiting import until
 
 SECOND, HOUR = 10**9, 3600 * 10**9
@@ -46,10 +46,7 @@ def test_a_log_of_45_s_is_45_s_long(tmp_path: Path, steady: bool, monkeypatch: p
     """Earlier versions' recorders followed the clock of the computer: their jump is left out, and told."""
     if not steady:
         monkeypatch.delitem(segment.TIMES, segment.CLOCK)
-    log = open_segment(tmp_path / "run.mcap", {})
-    for key, message, received in minute(received_jumps=not steady):
-        log.save([Entry(key, type(message), message.SerializeToString(), received, 1, message.header.sequence)])
-    log.finish()
+    written(tmp_path / "run.mcap", minute(received_jumps=not steady))
     figures = analyse(tmp_path)
     assert figures["seconds"] == (45.0 if steady else 44.0), "the second of the jump is not known"
     assert figures["processes"]["actor-0"]["silences"] == 0
@@ -58,12 +55,10 @@ def test_a_log_of_45_s_is_45_s_long(tmp_path: Path, steady: bool, monkeypatch: p
 
 def test_recorders_hours_apart_and_pauses_between_files_add_nothing(tmp_path: Path) -> None:
     for start in (BEGIN, BEGIN - 7 * HOUR, BEGIN + 9 * HOUR):
-        log = open_segment(tmp_path / "run.mcap", {})
-        for number in range(11):
-            header = pb.Header(run=1, sequence=number + 1 + (start != BEGIN) * 11 + (start > BEGIN) * 11)
-            step = pb.Step(header=header, actor="a", robot="ground", episode=header.sequence)
-            log.save([Entry("step/ground/a", pb.Step, step.SerializeToString(), start + number * SECOND, 1, number)])
-        log.finish()
+        first = 1 + (start != BEGIN) * 11 + (start > BEGIN) * 11
+        headers = [pb.Header(run=1, sequence=first + number) for number in range(11)]
+        steps = [pb.Step(header=header, actor="a", robot="ground", episode=header.sequence) for header in headers]
+        written(tmp_path / "run.mcap", (("step/ground/a", step, start + k * SECOND) for k, step in enumerate(steps)))
     figures = analyse(tmp_path)
     assert (figures["steps"], figures["seconds"], figures["cuts"]) == (33, pytest.approx(30.0), [])
 

@@ -17,7 +17,6 @@ from brakeline.logs.viewer import SCRIPTS, hex_color, rgb_color, viewer_file
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from tests.browser import Page
-from tests.logs.conftest import show
 from tests.logs.sample_log import Writer
 from tests.robots import GROUND, QUADROTOR
 
@@ -93,7 +92,7 @@ def test_in_the_air_there_are_a_side_view_and_the_altitude_and_no_grey_map(fligh
 def test_without_webgl_the_page_says_so_and_draws_the_plan(tab: Page, report: tuple[Path, dict[str, Any]]) -> None:
     without = "HTMLCanvasElement.prototype.getContext = () => null"
     script = tab.call("Page.addScriptToEvaluateOnNewDocument", source=without)
-    show(tab, report[0])
+    tab.show(report[0])
     tab.call("Page.removeScriptToEvaluateOnNewDocument", **script)
     assert "no WebGL" in tab.value("document.querySelector('#picker .nowebgl').textContent")
     assert tab.value(f"{STAGE}.querySelector('svg') !== null")

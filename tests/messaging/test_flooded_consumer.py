@@ -77,7 +77,7 @@ def test_refusals_of_a_flood_do_not_block_the_process_that_logs_them(
     assert time.monotonic() - begun < 10.0, "and the process ends"
 
 
-def test_a_thread_that_logs_never_waits_for_the_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_that_logs_never_waits_for_the_bus() -> None:
     """A link that takes nothing costs log lines, which are counted, and no time of the thread that drives a robot."""
     stuck, released = threading.Event(), threading.Event()
 

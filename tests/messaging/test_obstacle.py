@@ -45,19 +45,6 @@ def sample(obstacle, rng, count=4000):
     return np.array(obstacle.position) + rotate(local, obstacle.yaw)
 
 
-def cast(obstacles, at, ways, far):
-    """Return ranges along unit vectors (..., d) by sphere tracing: a step is the distance to the nearest obstacle."""
-    shapes, flat = Shapes.of(obstacles, ways.shape[-1]), ways.reshape(-1, ways.shape[-1])
-    ranges, going = np.zeros(len(flat)), np.arange(len(flat))
-    for _ in range(400):
-        steps = shapes.distance(at + ranges[going, None] * flat[going]).min(axis=0)
-        ranges[going] = np.minimum(ranges[going] + steps, far)
-        going = going[(steps > 1e-12) & (ranges[going] < far)]
-        if not len(going):
-            break
-    return ranges.reshape(ways.shape[:-1])
-
-
 def holds(obstacle, point, slack=1e-9):
     """Is the point in the solid? By the words again."""
     local = rotate(point - np.array(obstacle.position), -obstacle.yaw)

@@ -17,8 +17,9 @@ from brakeline.messaging.scan import BeamTracks, Scan
 from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import patch_free_ranges
-from tests.messaging.test_obstacle import cast, sample
+from tests.messaging.test_obstacle import sample
 from tests.robots import QUADROTOR
+from tests.safety.ray_casting import cast
 
 RINGS, COLUMNS, FAR, WIDTH = 45, 90, 8.0, 0.6  # every 4°
 EDGE = 0.5 * math.pi * (1.0 - 1.0 / RINGS)
@@ -49,9 +50,9 @@ def taken(rng, obstacles, noise=0.0, at=(0.0, 0.0, 0.0), **more):
     return RangeImage(noisy, at, low=-EDGE, high=EDGE, **more)
 
 
-def solid(obstacles, rng, within=FAR):
+def solid(obstacles, rng):
     points = np.concatenate([sample(obstacle, rng, 3000) for obstacle in obstacles])
-    return points[np.linalg.norm(points, axis=1) < within]
+    return points[np.linalg.norm(points, axis=1) < FAR]
 
 
 def free_towards(image, points):
@@ -176,12 +177,14 @@ def test_two_at_once_and_half_a_beam_are_refused():
     set_measurement(message, RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0)))
     with pytest.raises(BadScan, match="not both"):
         measurement_in(message)
-    message.image.ranges += b"0"
+    image = message.image
+    image.ranges += b"0"
     with pytest.raises(BadScan, match="two bytes"):
-        image_of(message.image)
-    message.image.ClearField("attitude")
+        image_of(image)
+    image.ranges = image.ranges[:-1]
+    image.ClearField("attitude")
     with pytest.raises(BadScan, match="attitude"):
-        image_of(message.image)
+        image_of(image)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from brakeline.messaging.task import read_task
 JSON, TOML = '{"a":' * 100_000, "a = " + "[" * 100_000
 
 
-def test_what_is_nested_too_deeply_is_an_error_of_ours(tmp_path: Path) -> None:
+def test_what_is_nested_too_deeply_is_an_error_of_ours() -> None:
     for text in (JSON, "{", "\ud800", ""):
         with pytest.raises(BadText, match="not JSON"):
             parse_json(text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import signal
 import subprocess
 from contextlib import redirect_stderr, redirect_stdout
@@ -32,6 +31,13 @@ def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.Compl
     if words[0] in OF_ITS_OWN:
         return subprocess.run([*BRAKELINE, *words], check=False, capture_output=True, text=True, timeout=timeout)
     return _in_this_process(words)
+
+
+def succeeded(*arguments: object, timeout: float = PATIENCE) -> str:
+    """Run a command, which must succeed. Returns what it prints."""
+    done = brakeline(*arguments, timeout=timeout)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def refused(*arguments: object) -> str:
@@ -155,11 +161,3 @@ class Run:
         assert printed.count("\n") == 1, f"one JSON object and nothing else: {printed}\n{self.errors.read_text()}"
         figures: dict[str, Any] = json.loads(printed)
         return figures
-
-
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True

@@ -12,7 +12,7 @@ from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
-from tests.system.runs import brakeline, refused
+from tests.system.runs import brakeline, refused, succeeded
 from tests.waiting import until
 
 LEARNING = ("--learner.td3.hidden", 16, "--learner.td3.batch", 16, "--learner.td3.warmup", 100)
@@ -24,8 +24,7 @@ def test_safety_learner_actor_and_recorder_alone_with_the_keys_that_were_handed_
 ):
     keys, parts, endpoint = tmp_path / "keys", tmp_path / "parts", free_endpoint("tls")
     there = ("--connect", endpoint)
-    done = brakeline("keys", keys, *NAMES, "--hand-out", parts)
-    assert done.returncode == 0, done.stderr
+    succeeded("keys", keys, *NAMES, "--hand-out", parts)
     names = {"ca.pem", "safety.pem", "safety.key", "names", "vouchers.key", "signers"}
     assert {path.name for path in (parts / "safety").iterdir()} == names
     assert {path.name for path in (parts / "actor-7").iterdir()} == {"ca.pem", "actor-7.pem", "actor-7.key"}
@@ -36,8 +35,7 @@ def test_safety_learner_actor_and_recorder_alone_with_the_keys_that_were_handed_
 
     model = method_path(GROUND, "ddpc", ModelConfig())
     assert "no seal" in refused("safety", "ground", "--listen", endpoint, "--keys", parts / "safety")
-    signed = brakeline("keys", parts / "certify", "--sign", model)
-    assert signed.returncode == 0, signed.stderr
+    succeeded("keys", parts / "certify", "--sign", model)
     try:
         safety = launch("safety", "ground", "--listen", endpoint)
         # Before anybody else is there: the processes may be started in any order.
@@ -61,9 +59,8 @@ def test_safety_learner_actor_and_recorder_alone_with_the_keys_that_were_handed_
     with Ros2Command(connect=(endpoint,), keys=parts / "client")._asker(robot_named("ground"), lead=30.0) as question:
         (reply,) = question([pb.Request(robot="ground")])
     assert reply.error.field == "plan", "a ROS robot's questions are heard, and this one was empty"
-    status = brakeline("status", *there, "--keys", parts / "viewer")
-    assert status.returncode == 0, status.stderr
-    assert "safety" in status.stdout and "recorder" in status.stdout
+    status = succeeded("status", *there, "--keys", parts / "viewer")
+    assert "safety" in status and "recorder" in status
 
     assert learner.wait(120.0) == 0, "the last step is learned from"
     assert (tmp_path / "learner" / "policy.safetensors").exists()

@@ -15,7 +15,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.model.dataset import Dataset
 from tests.accepting import WORDS
 from tests.robots import GROUND
-from tests.system.runs import Run, brakeline
+from tests.system.runs import Run, succeeded
 from tests.waiting import PATIENCE, until
 
 DRIVEN = 1000  # steps of both actors
@@ -31,9 +31,8 @@ def test_a_set_from_a_run_is_published_into_the_run_by_hand(data_folder, tmp_pat
         metrics = run.watch()
         run.until_steps(DRIVEN)
         words = ("--certificates", "residual", "--mode", "one-step", "--few", "--publish", "--json")
-        certify = brakeline("certify", "--data", run.folder, "--last", DRIVEN, *words, *WORDS, *run.there)
-        assert certify.returncode == 0, certify.stderr
-        version = json.loads(certify.stdout)["residual"]["version"]
+        certified = succeeded("certify", "--data", run.folder, "--last", DRIVEN, *words, *WORDS, *run.there)
+        version = json.loads(certified)["residual"]["version"]
         until(lambda: metrics.processes["safety-0"].notes["model ground"] == version, "the new model in use")
         run.until_steps(100)
         figures = run.end(signal.SIGINT)

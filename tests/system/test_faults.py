@@ -8,6 +8,7 @@ import subprocess
 import time
 
 import numpy as np
+import psutil
 import pytest
 
 from brakeline.deploy.interpreter import PYTHON
@@ -18,7 +19,7 @@ from brakeline.logs.figure_tables import analyse
 from brakeline.logs.reader import open_log
 from tests.accepting import WORDS
 from tests.robots import ROBOTS
-from tests.system.runs import Run, alive
+from tests.system.runs import Run
 from tests.waiting import PATIENCE, until
 
 KINDS = ("ground", "quadrotor")
@@ -136,7 +137,7 @@ def test_a_second_interrupt_ends_the_launcher_at_once_and_leaves_nothing_either(
 
 def test_a_child_whose_launcher_is_gone_ends_without_a_word_to_the_bus(tmp_path):
     (tmp_path / CONFIG).write_text(encode(EXPERIMENTS["debug"]))
-    nobody = next(pid for pid in range(2**15, 2**22) if not alive(pid))
+    nobody = next(pid for pid in range(2**15, 2**22) if not psutil.pid_exists(pid))
     with socket.create_server(("127.0.0.1", 0)) as bus:
         endpoint = f"tcp/127.0.0.1:{bus.getsockname()[1]}"
         (tmp_path / "endpoint").write_text(json.dumps({"endpoint": endpoint, "pid": nobody}))

@@ -6,14 +6,12 @@ import subprocess
 from brakeline.messaging.free_ports import free_endpoint
 from tests.accepting import WORDS
 from tests.deploy.data.porter import FILE, drive, porter, write_csv
-from tests.system.runs import BRAKELINE, brakeline
+from tests.system.runs import BRAKELINE, brakeline, succeeded
 from tests.waiting import until
 
 
 def figures(*words):
-    done = brakeline(*words, "--json")
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(succeeded(*words, "--json"))
 
 
 def test_four_commands_from_a_csv_to_an_answer(tmp_path, monkeypatch):

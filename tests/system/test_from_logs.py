@@ -17,7 +17,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.policy_weights import MLP
 from tests.robots import GROUND
-from tests.system.runs import brakeline
+from tests.system.runs import succeeded
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +27,7 @@ def steps(logged_run: Path) -> list[pb.Step]:
 
 def test_offline_a_policy_comes_from_the_log_alone(logged_run: Path, steps: list[pb.Step], tmp_path: Path) -> None:
     words = ("train", "ground", "--experiment", "debug", "--from-logs", logged_run, "--actors", "0")
-    done = brakeline(*words, "--out", tmp_path / "offline", "--json")
-    assert done.returncode == 0, done.stderr
-    figures = json.loads(done.stdout)
+    figures = json.loads(succeeded(*words, "--out", tmp_path / "offline", "--json"))
     learner = figures["learners"]["ground"]
     assert figures["finished"] and figures["steps"] == 0, "nobody drove"
     assert figures["from_logs"]["published"] == learner["steps"] == len(steps)
@@ -47,9 +45,7 @@ def test_a_lost_checkpoint_comes_back_from_the_log(logged_run: Path, steps: list
     shutil.rmtree(folder / "learner")
     more = 60
     words = ("train", "--resume", folder, "--from-logs", folder, "--steps", len(steps) + more)
-    done = brakeline(*words, "--json")
-    assert done.returncode == 0, done.stderr
-    figures = json.loads(done.stdout)
+    figures = json.loads(succeeded(*words, "--json"))
     learner = figures["learners"]["ground"]
     assert figures["from_logs"]["published"] == len(steps), "the figures say how many steps came back"
     assert (learner["steps"], learner["duplicates"]) == (len(steps) + more, 0)

@@ -9,32 +9,30 @@ import pytest
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
 from brakeline.logs.episode_stats import EpisodeStats
 from tests.robots import GROUND
-from tests.system.runs import brakeline
+from tests.system.runs import succeeded
 
 STEPS = 25_000
 EPISODES = 200
 HOUR = 3600.0
 
 
-def returns(policy: str, episodes: int = EPISODES) -> np.ndarray[Any, np.dtype[np.float64]]:
+def returns(policy: str) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return the rewards of fresh episodes behind the filter."""
     found: list[float] = []
 
     def each(tally: EpisodeStats) -> None:
         found.append(tally.returns[-1])
 
-    evaluate(GROUND, Evaluation(policy=policy, episodes=episodes), each)
+    evaluate(GROUND, Evaluation(policy=policy, episodes=EPISODES), each)
     return np.array(found)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(HOUR)
 def test_offline_training_beats_chance(data_folder: Path, tmp_path: Path) -> None:
-    done = brakeline("train", "ground", "--steps", STEPS, "--out", tmp_path / "run", "--json", timeout=HOUR)
-    assert done.returncode == 0, done.stderr
+    succeeded("train", "ground", "--steps", STEPS, "--out", tmp_path / "run", "--json", timeout=HOUR)
     words = ("train", "ground", "--from-logs", tmp_path / "run", "--actors", 0)
-    done = brakeline(*words, "--out", tmp_path / "offline", "--json", timeout=HOUR)
-    assert done.returncode == 0, done.stderr
+    succeeded(*words, "--out", tmp_path / "offline", "--json", timeout=HOUR)
     learned = returns(str(tmp_path / "offline" / "learner" / "policy.safetensors"))
     chance = returns("random")
     difference = learned.mean() - chance.mean()

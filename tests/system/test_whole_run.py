@@ -18,7 +18,7 @@ from brakeline.logs.reader import find, read
 from brakeline.messaging.policy_weights import MLP
 from tests.logs.sample_log import agree, counted, decoded
 from tests.robots import GROUND
-from tests.system.runs import brakeline, refused
+from tests.system.runs import refused, succeeded
 
 ROOT = Path(__file__).parents[2]
 # The log lacks what these publish after the recorder has stopped.
@@ -28,13 +28,6 @@ CLOSED_LOOP = (
     *("max_speed", "mean_reward", "decision_ms", "containment", "outside", "actors", "learners"),
     *("method", "certificate", "policy", "arena", "seed"),
 )
-
-
-def succeeded(*words: object) -> str:
-    """Return what a command prints. The command must succeed."""
-    done = brakeline(*words)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import RealtimeGroundRobot
 from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES
 from brakeline.sim.lidar import Lidar
-from tests.actors.ros2.test_ros_inputs import scan_of
+from tests.actors.ros2.test_ros_inputs import odometry, scan_of
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
@@ -139,13 +139,7 @@ def _decide(inputs, gate, began, now, number):
 
 def _odometry(at, measured):
     x, y, heading, speed, turn_rate = map(float, measured)
-    none = np.zeros(36)
-    return cdr.Odometry(
-        header=cdr.header(at, "odom"),
-        child_frame_id="base_footprint",
-        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, y, heading), covariance=none),
-        twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, turn_rate), covariance=none),
-    )
+    return odometry(at, x, speed, heading, y=y, turn_rate=turn_rate)
 
 
 def _scan(lidar, ranges, at):

@@ -96,14 +96,9 @@ def test_without_a_command_the_proposal_is_to_stand():
 
 @pytest.mark.parametrize("aside", [True, False])
 def test_the_requests_say_whether_a_blocked_robot_turns_aside(aside):
-    asked = []
-
-    def ask(requests):
-        asked.extend(requests)
-        return allow(requests)
-
-    CommandGate(ROBOT, ask, turn_aside=aside).decide(STATE, (), command(0.2), 0.0, 0)
-    assert [request.turn_aside for request in asked] == [aside]
+    asked = CautiousFilter(largest=1.0)
+    CommandGate(ROBOT, asked, turn_aside=aside).decide(STATE, (), command(0.2), 0.0, 0)
+    assert [request.turn_aside for request in asked.requests] == [aside]
 
 
 class CautiousFilter:

@@ -144,6 +144,40 @@ def steered(simulated=False, stamped=False, sends_stamped=None):
             assert not thread.is_alive()
 
 
+class Stalling:
+    """A clock that waits exactly, and once `stall` seconds longer."""
+
+    def __init__(self):
+        self.time, self.stall = 100.0, 0.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, moment, stop, patience):
+        self.time, self.stall = max(self.time, moment) + self.stall, 0.0
+        return True
+
+    def jumped(self):
+        return 0.0
+
+
+@contextmanager
+def stepped(**settings):
+    """Begin no thread: yield a node, its clock, a call that runs one period of it, and the requests that it sends."""
+    stop, requests = threading.Event(), []
+
+    def ask(asked):
+        requests.extend(asked)
+        return allow(asked)
+
+    node = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),)), **settings), ask, stop)
+    node.clock = Stalling()
+    try:
+        yield node, node.clock, lambda due: node._period(due, stop), requests
+    finally:
+        node.close()
+
+
 def test_a_missing_input_stops_the_robot_until_it_comes_again_and_the_end_of_the_process_does():
     with steered() as (robot, node_under_test):
         for what, because in (
@@ -211,17 +245,8 @@ def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():
 
 def test_after_a_jump_of_the_pose_the_plan_from_before_does_not_count_as_verified():
     """The robot brakes along it all the same, says why, and goes on."""
-    stop, requests = threading.Event(), []
-
-    def ask(asked):
-        requests.extend(asked)
-        return allow(asked)
-
-    settings = Ros2Settings(ros=RosSettings(listen=(free_endpoint(),)), sensors=SensorSettings(mount=PlanarPose()))
-    node_under_test = FilterNode(settings, ask, stop)
-    try:
-        gate, clock, inputs = node_under_test.gate, Stalling(), node_under_test.inputs
-        node_under_test.clock = clock
+    with stepped(sensors=SensorSettings(mount=PlanarPose())) as (node, clock, period, requests):
+        gate, inputs = node.gate, node.inputs
 
         def drive(x):
             for i in range(1, 12):
@@ -233,84 +258,51 @@ def test_after_a_jump_of_the_pose_the_plan_from_before_does_not_count_as_verifie
         due, kinds = 100.2, []
         for x in (0.0, 0.0, 0.0, 2.0, 2.0, 2.0):
             drive(x)
-            due = node_under_test._period(due, stop)
+            due = period(due)
             kinds.append((gate.kind, gate.reason))
         assert "the pose jumped by 2.00 m" in kinds[4][1] and kinds[4][0] == BLIND
         models = [request.model for request in requests]
         assert models[2] == "m" and models[3] == UNVERIFIED and not requests[3].plan_token
         assert gate.kind == "allowed"
-    finally:
-        node_under_test.close()
-
-
-class Stalling:
-    """A clock that waits exactly, and once `stall` seconds longer."""
-
-    def __init__(self):
-        self.time, self.stall = 100.0, 0.0
-
-    def now(self):
-        return self.time
-
-    def wait(self, moment, stop, patience):
-        self.time, self.stall = max(self.time, moment) + self.stall, 0.0
-        return True
-
-    def jumped(self):
-        return 0.0
 
 
 def test_an_answer_for_a_past_period_does_not_count():
-    stop = threading.Event()
-    node_under_test = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), allow, stop)
-    try:
-        gate, clock = node_under_test.gate, Stalling()
+    with stepped() as (node, clock, period, _):
+        gate = node.gate
         full = lambda number: RawCommand(np.array([0.25, 0.0]), clock.time, number)  # noqa: E731
-        node_under_test.clock = clock
-        node_under_test._decide = lambda began, number: gate.decide(np.zeros(5), (), full(number), began, number)
+        node._decide = lambda began, number: gate.decide(np.zeros(5), (), full(number), began, number)
         due = 100.0
         for _ in range(3):
-            due = node_under_test._period(due, stop)
+            due = period(due)
         assert gate.kind == "allowed" and gate.input[0] == 0.25
         clock.stall = 1.5
-        due = node_under_test._period(due, stop)
+        due = period(due)
         assert gate.kind == LATE and gate.stats.slips == 1 and due > clock.now()
         assert gate.input[0] < 0.25, "it brakes"
-    finally:
-        node_under_test.close()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 1.1, 2.5])
 def test_no_decision_rests_on_an_input_that_the_base_executed_for_part_of_a_period(share):
     """A period begins late by a share of its length: the base went on with the input before."""
-    stop, requests, period, sent = threading.Event(), [], ROBOT.period, []
-
-    def ask(asked):
-        requests.extend(asked)
-        return allow(asked)
-
-    node_under_test = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), ask, stop)
-    try:
-        gate, clock = node_under_test.gate, Stalling()
+    sent = []
+    with stepped() as (node, clock, period, requests):
+        gate = node.gate
         command = lambda number: RawCommand(np.array([0.05 + 0.1 * (number % 2), 0.0]), clock.time, number)  # noqa: E731
-        node_under_test.clock = clock
-        node_under_test._decide = lambda began, number: gate.decide(np.zeros(5), (), command(number), began, number)
-        node_under_test._send = lambda action: sent.append((clock.now(), action[0]))
+        node._decide = lambda began, number: gate.decide(np.zeros(5), (), command(number), began, number)
+        node._send = lambda action: sent.append((clock.now(), action[0]))
         due, before = 100.0, 0
         for number in range(12):
             if number == 5:
-                clock.stall, before = share * period, len(requests)
-            due = node_under_test._period(due, stop)
+                clock.stall, before = share * ROBOT.period, len(requests)
+            due = period(due)
             assert number != 5 or gate.kind == LATE
         sent.append((due, 0.0))
         assert requests[before].model != "m" and requests[-1].model == "m"
         for request in requests:
-            end = request.time + period
+            end = request.time + ROBOT.period
             for (since, value), (until_, _) in pairwise(sent):
                 if value != request.plan[0]:
                     assert min(until_, end) - max(since, request.time) < 0.02 + 1e-9, request.time
-    finally:
-        node_under_test.close()
 
 
 def test_clocks_that_differ_stop_the_robot():

@@ -39,13 +39,13 @@ ROBOT = GROUND.in_real_time()
 LIMITS = StepLimits.of(ROBOT)  # 0.25 m/s and 0.5 rad/s
 
 
-def odometry(at, x=0.0, speed=0.0, heading=0.0, frame="odom"):
+def odometry(at, x=0.0, speed=0.0, heading=0.0, frame="odom", y=0.0, turn_rate=0.0):
     none = np.zeros(36)
     return cdr.Odometry(
         header=cdr.header(at, frame),
         child_frame_id="base_footprint",
-        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, 0.0, heading), covariance=none),
-        twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, 0.0), covariance=none),
+        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, y, heading), covariance=none),
+        twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, turn_rate), covariance=none),
     )
 
 
@@ -321,7 +321,7 @@ def test_transforms_can_replace_odometry():
     assert inputs.state(0.5, 0.58) == pytest.approx([0.1, 0.0, 0.0, 0.2, 0.0], abs=1e-6)
 
 
-def test_a_clock_that_was_set_reports_the_jump_once(monkeypatch):
+def test_a_clock_that_was_set_reports_the_jump_once():
     simulated = RosSimulatedClock()
     for stamp in (100.0, 99.9, 101.0):
         simulated.on_clock(cdr.Clock(clock=cdr.time_of(stamp)))

@@ -105,17 +105,11 @@ def test_scans_with_few_or_many_beams(beams):
     assert 1 <= len(boxes_of(space(width=0.05), free_but(*range(-(-beams // 360)), n=beams))) <= 3
 
 
-FORWARD = math.radians(270.0)
-
-
-def forward_scan(at, ranges=math.inf):
-    """Return a scan of 270° in front, with one range for all beams [m]."""
-    step = math.pi / 180.0
-    return scan_of(np.full(270, ranges), header=cdr.header(at, "s"), angle_min=-0.5 * FORWARD, angle_increment=step)
-
-
-def fed(unknown, at, pose, ranges=math.inf):
-    return boxes_of(unknown, forward_scan(at, ranges), np.tile(pose, (270, 1)))
+def fed(unknown, at, pose):
+    """Return the boxes after a scan of 270° in front that hits nothing."""
+    step, header = math.pi / 180.0, cdr.header(at, "s")
+    scan = scan_of(np.full(270, math.inf), header=header, angle_min=-135.0 * step, angle_increment=step)
+    return boxes_of(unknown, scan, np.tile(pose, (270, 1)))
 
 
 def stating(radius=0.5):
