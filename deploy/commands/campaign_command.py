@@ -65,9 +65,8 @@ class CampaignCommand:
         tables = {robot: self._campaign(robot) for robot in self.robots}
         if self.json:
             print_json(tables)
-        filtered = [cell for table in tables.values() for cell in table["cells"] if cell["model_set"] != "none"]
-        searches = [one for table in tables.values() for one in table["searches"] if one["model_set"] != "none"]
-        return COLLIDED if any(one["collisions"] for one in (*filtered, *searches)) else 0
+        driven = [one for table in tables.values() for one in (*table["cells"], *table["searches"])]
+        return COLLIDED if any(one["collisions"] for one in driven if one["model_set"] != "none") else 0
 
     def check_options(self) -> None:
         """Raise ValueError for numbers that make no sense, and for lists without a name: a table would become empty."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.cli import main
+from brakeline.sim.ground_estimator import wrap
 from tests.deploy.data.porter import COLUMNS, FILE, Porter, drive, driven_by, joystick, write_csv
 
 pytestmark = pytest.mark.usefixtures("reading_here")
@@ -23,12 +24,8 @@ def late(values, columns, rows):
     values[:rows, columns] = 0.0
 
 
-def wrapped(angles):
-    return (angles + math.pi) % (2.0 * math.pi) - math.pi
-
-
 def clockwise_from_y(values):
-    values[:, HEADING] = wrapped(math.pi / 2.0 - values[:, HEADING])
+    values[:, HEADING] = wrap(math.pi / 2.0 - values[:, HEADING])
 
 
 def swap(one, other):
