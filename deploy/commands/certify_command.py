@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
-from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
+from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.progress import PERCENT, by_share, under_way
 from brakeline.errors import Unsupported
 from brakeline.logs.stacking_table import StackingTable
@@ -151,7 +151,11 @@ class CertifyCommand:
             config = model.model_config
             errors.print(f"[red]{config.certificate}, {config.mode}: not put to use:[/] {escape(refused)}")
             return {"not_used": refused}
-        return {"in_use": str(self._save(model, data))} if self.use else {}
+        if not self.use:
+            return {}
+        from brakeline.deploy.run.run_keys import put_to_use
+
+        return {"in_use": str(put_to_use(model, data, self.endpoints.keys or options.default_keys()))}
 
     def _refusal(self, model: ModelSet, data: Dataset) -> str:
         return refusal(data.robot, model.about, self.accept_bound)
@@ -169,19 +173,6 @@ class CertifyCommand:
         lines += [f"missing: {text}" for text in recording_advice(models[0][1], data)] if models else []
         for line in lines:
             console.print(line, markup=False)
-
-    def _save(self, model: ModelSet, data: Dataset) -> Path:
-        """Write a model set to the path, which is returned, where other commands load it; signed, if there is a key."""
-        from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
-
-        path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or options.default_keys()
-        seal_of(path).unlink(missing_ok=True)
-        if keys is not None and (keys / KEY).exists():
-            ModelSigner.load(keys).sign(model, data).save(path)
-        else:
-            model.save(path)
-        note_mode(model.robot, model.model_config)
-        return path
 
     def _load(self) -> tuple[Path, Dataset, str]:
         """Return the source, its data and a note. Raises ValueError if a named data set does not exist."""

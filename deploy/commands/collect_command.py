@@ -74,8 +74,9 @@ class CollectCommand:
             raise ValueError("the options of a first flight, such as --minutes and --accept-bound, need --url")
 
     def _first_flight(self) -> int:
-        from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
+        from brakeline.deploy.data.data_paths import record_path
         from brakeline.deploy.run.first_flight_run import fly
+        from brakeline.deploy.run.run_keys import put_to_use
         from brakeline.messaging.task import robot_maybe_with_task
         from brakeline.safety.model.stated_bound import accepted_bound, refusal
 
@@ -99,9 +100,7 @@ class CollectCommand:
                 errors.print(f"[red]not put to use:[/] {escape(refused)}")
                 errors.print(f"to validate it again: brakeline certify {robot.name} --data {path} --few", markup=False)
             else:
-                used = model_path(model.robot, model.model_config)
-                model.save(used)
-                note_mode(model.robot, model.model_config)
+                used = put_to_use(model, flight.data, options.default_keys())
                 figures["model"] = str(used)
                 text.append(f"{used}: in use from now on")
         print_result(self.json, figures, *text, *(f"missing: {line}" for line in flight.missing))

@@ -57,6 +57,8 @@ def fly(settings: AutopilotSettings, on_start: Callable[[Arena], Any] = lambda a
             return serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < settings.seconds <= clock.now(), truth)
     finally:
         link.close()
+        if truth is not None:
+            truth.close()
 
 
 def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot:

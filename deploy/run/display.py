@@ -87,8 +87,8 @@ def run_phase(run: Launcher) -> str:
     """Return what the run is doing now."""
     if run.ending:
         return "ending every process in order"
-    known = run.metrics.processes.copy()
-    starting = [child.spec.name for child in run.processes if child.spec.name not in known and not child.finished]
+    heard = run.metrics.processes.copy()
+    starting = [child.spec.name for child in run.processes if child.spec.name not in heard and not child.finished]
     if starting:
         return f"starting {', '.join(starting)}"
     if not any(stats.steps for stats in run.metrics.actors.copy().values()) and run.config.actors:
