@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from contextlib import suppress
+from inspect import isfunction, signature
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
 
     Args:
         name: a scripted policy, a stored one (`trained` and others in policies/, or beside the task file), `untrained`,
-            the folder of a run, a weights file, `FILE.py:CLASS` for code of your own, or a CSV file of inputs as
-            `brakeline excite` prints them.
+            the folder of a run, a weights file, `FILE.py:NAME` for a class or function of your own, or a CSV file of
+            inputs as `brakeline excite` prints them.
         seed: of scripted and untrained policies.
 
     Raises:
@@ -46,16 +47,18 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
 
 
 def _own_policy(place: str, robot: RobotWithTask, generator: np.random.Generator) -> Policy:
-    """Return the object that a class in a Python file makes for this robot, as a policy. Raises UnknownTask.
+    """Return a function in a Python file, or the object that a class there makes for this robot, as a policy.
 
-    The policy raises BadInput if the object returns anything but an input.
+    Raises UnknownTask. The policy raises BadInput if it returns anything but an input.
     """
     make = load_code(place, Path())
+    is_policy = isfunction(make) and [*signature(make).parameters][:1] == ["observation"]
     try:
-        policy: Policy = make(robot, generator)
+        policy: Policy = make if is_policy else make(robot, generator)
     except TypeError as error:
         raise UnknownTask(
-            f"{place} cannot be called with (robot, generator), as a policy's class is: {error}"
+            f"{place} is no function of (observation, info), and it cannot be called with (robot, generator), as a "
+            f"policy's class is: {error}"
         ) from error
     if not callable(policy):
         raise UnknownTask(f"an object of {place} cannot be called with (observation, info): define __call__")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
@@ -23,7 +24,7 @@ from brakeline.deploy.experiments.comparison_cells import (
     learning,
     quick,
 )
-from brakeline.deploy.experiments.experiment_jobs import complete, task_hash
+from brakeline.deploy.experiments.experiment_jobs import Job, complete, read, task_hash
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
 from brakeline.deploy.run.run_config import SEEDS
@@ -123,6 +124,7 @@ class CompareCommand:
                 complete(trials, results, runs, self.engine, self.again, say)
                 continue
             cells, others = jobs_of.get(robot, ([], []))
+            self._say_stored(robot, [*cells, *others], results)
             finished = complete([*cells, *others], results, runs, self.engine, self.again or self.quick, say)
             shown = finished[: len(cells)] if self.quick and not self.table else stored_cells(results, robot)
             if not shown:
@@ -134,6 +136,13 @@ class CompareCommand:
         if self.json:
             print_json(tables)
         return 0
+
+    def _say_stored(self, robot: str, jobs: Sequence[Job], results: Path) -> None:
+        """Print how many results are stored already, before nothing happens for minutes."""
+        if jobs and not (self.again or self.quick):
+            stored = sum(read(results, job) is not None for job in jobs)
+            advice = ": --again makes them anew, another --results folder makes others" if stored else ""
+            say(robot, f"{stored} of {len(jobs)} results are stored in {results}{advice}")
 
     def _check_options(self) -> None:
         """Raise ValueError for options that make no sense, or that do nothing beside --table or --tune."""
@@ -216,7 +225,7 @@ class CompareCommand:
         from brakeline.deploy.experiments.results_page import RobotResults
 
         figures = table(cells)
-        text = markdown(figures)
+        text = markdown(figures, self.quick)
         write_atomically(folder / "table.md", f"{text}\n".encode())
         write_atomically(folder / "table.json", f"{json.dumps(plain(figures), indent=1)}\n".encode())
         learning_curves(cells, folder / "curves.png")

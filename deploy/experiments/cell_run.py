@@ -40,6 +40,7 @@ from brakeline.messaging.topics import EPISODE
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.safety.methods import Model
 from brakeline.safety.model.model_config import DDPC, SAILR
+from brakeline.safety.rivals.own_code import OwnCode
 from brakeline.safety.rivals.pretrained import Pretrained
 
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
@@ -213,7 +214,8 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, Any]:
     """Return the cost of pre-training, and a rival's settings. Our data come from a yard without obstacles."""
     if isinstance(model, Pretrained):
         about = {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
-        return about | {"settings": dict(model.settings)}
+        source = {"obstacles": model.ready().obstacles} if isinstance(model, OwnCode) else {}
+        return about | source | {"settings": dict(model.settings)}
     return {"samples": str(load_or_record(robot).steady().periods), "collisions": "0"}
 
 

@@ -247,12 +247,16 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
 
 
-def markdown(figures: dict[str, Any]) -> str:
-    """Return the tables of one robot as Markdown, with the paper's figures in italics."""
+def markdown(figures: dict[str, Any], quick: bool = False) -> str:
+    """Return the tables of one robot as Markdown, with the paper's figures in italics.
+
+    quick: the runs are too short to say anything about the methods.
+    """
     robot, counts = figures["robot"], {method: len(seeds) for method, seeds in figures["seeds"].items()}
     lines = [
         f"# {robot}",
         "",
+        *(["**A test of the code (`--quick`), no result**: few steps, small networks, one seed.", ""] if quick else []),
         f"Every method after {figures['steps']} training steps; {figures['episodes']} episodes for each of n seeds, "
         "the same for all methods and seeds. In brackets: 95 % intervals by the bootstrap, which resamples the seeds "
         "and, for all seeds alike, the episodes; where nothing or all happened, the exact one of Clopper and Pearson, "
@@ -273,7 +277,7 @@ def markdown(figures: dict[str, Any]) -> str:
         for row in next(iter(methods.values()), {}):
             rows.append([row, *(written(row, values[row]) for values in methods.values())])
             beside = [_paper(robot, row, method) for method in methods]
-            if part not in ("training", "deployment") and any(beside):
+            if part not in ("training", "deployment") and any(beside) and not quick:
                 rows.append(["*paper*", *(f"*{text}*" if text else "" for text in beside)])
         heads = [f"{compared(m).label}, n = {counts[m]}" if m in counts else m for m in methods]
         lines += [f"## {part}", "", *markdown_table(["", *heads], rows), ""]

@@ -192,7 +192,8 @@ def _methods(robot_results: RobotResults) -> str:
         knows, versions = method.model, {cell["model"]["version"] for cell in cells if cell["model"]}
         if len(versions) > 1:
             knows += f"; made {len(versions)} times: {', '.join(sorted(versions))}"
-        rows.append([method.label, str(len(cells)), learner, method.obstacles, knows, samples, method.source])
+        obstacles = (model or {}).get("obstacles", method.obstacles)
+        rows.append([method.label, str(len(cells)), learner, obstacles, knows, samples, method.source])
     return "\n".join([*markdown_table(heads, rows), ""])
 
 

@@ -95,8 +95,9 @@ def refusal(robot: Robot, about: Mapping[str, str], accept_bound: float | None =
     accepted = f"{rounded_up(bound):g}"
     return (
         f"{statement}; {whose} is {percent(limit)}. {_remedy(about, limit)}. "
-        f"Or accept the bound: --accept-bound {accepted} (in Python accept_bound={accepted}; "
-        f"the limit itself is `accept_bound` in the description of {robot.kind})"
+        f"Or accept the bound, in this command alone: --accept-bound {accepted} (in Python accept_bound={accepted}). "
+        f"For every command: write accept_bound = {accepted} into the description of {robot.kind}, and run "
+        "`brakeline certify --use` again"
     )
 
 

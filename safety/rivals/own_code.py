@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from brakeline.errors import BadInput, BadModel
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Array
+from brakeline.messaging.task import needs_task
 from brakeline.messaging.task_code import load_code
 from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request, check_for_filter
@@ -24,10 +26,24 @@ from brakeline.safety.rivals.rival import Rival
 class OwnFilter(Rival):
     """Derive your filter from this class, and write `safe_input`. `self.robot` has inputs, bounds, period and body.
 
+    Attributes:
+        obstacles: what your filter knows of them, in the words of the results page.
+
     >>> class Half(OwnFilter):
     ...     def safe_input(self, request, proposal):
     ...         return 0.5 * proposal
     """
+
+    obstacles = "the arena's map"
+
+    @property
+    def rays(self) -> LidarRays:
+        """The rays of the policy's lidar: `directions` (R, d) in the robot's frame, and the largest `range` [m]."""
+        return needs_task(self.robot).task.rays
+
+    def ranges(self, request: Request) -> Array:
+        """Return the distances [m] that the rays measure (R,); one that meets nothing measures the largest range."""
+        return np.asarray(request.observation[: len(self.rays.directions)], dtype=float) * self.rays.range
 
     @abstractmethod
     def safe_input(self, request: Request, proposal: Array) -> Array | None:

@@ -35,6 +35,12 @@ class Agent:
     def __call__(self, observation, info):
         return self.input
 
+def steady(observation, info):
+    return [0.1, 0.2]
+
+def alone():
+    pass
+
 class Alone:
     pass
 
@@ -44,7 +50,7 @@ class Silent:
 """
 
 
-def test_a_class_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
+def test_a_class_or_a_function_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
     (tmp_path / "agent.py").write_text(AGENT)
     monkeypatch.chdir(tmp_path)
     first, again, other = (
@@ -52,6 +58,7 @@ def test_a_class_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
         for name, seed in (("agent.py:Agent", 3), (f"{tmp_path}/agent.py:Agent", 3), ("agent.py:Agent", 4))
     )
     assert np.allclose(first, 0.5 * GROUND.high(), atol=1e-3)
+    assert policy_named("agent.py:steady", GROUND, 0)(None, {}).tolist() == [0.1, 0.2]
     assert np.array_equal(first, again) and not np.array_equal(first, other), "the seed decides"
 
 
@@ -59,6 +66,7 @@ def test_a_class_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
     ("name", "said"),
     [
         ("agent.py:Alone", r"cannot be called with \(robot, generator\)"),
+        ("agent.py:alone", r"is no function of \(observation, info\)"),
         ("agent.py:Silent", "define __call__"),
         ("agent.py:Nobody", "agent.py has no 'Nobody'"),
         ("gone.py:Agent", "no code that can be loaded"),

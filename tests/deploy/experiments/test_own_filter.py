@@ -33,6 +33,16 @@ class Brake(OwnFilter):
     def safe_input(self, request, proposal):
         return None
 
+class ByRays(OwnFilter):
+    obstacles = "the observed rays"
+
+    def safe_input(self, request, proposal):
+        nearest = self.ranges(request).min()
+        assert self.rays.range == 3.5 and len(self.rays.directions) == 18
+        distance = request.obstacles.distance(request.state[:2]).min()
+        assert distance < nearest + 0.1, "no ray goes through an obstacle"
+        return proposal
+
 class Short(OwnFilter):
     def safe_input(self, request, proposal):
         return proposal[:1]
@@ -61,25 +71,31 @@ def test_an_evaluation_behind_an_own_filter_counts_its_interventions(
     assert figures["mean_speed"] < 0.6 * free["mean_speed"]
     braked = evaluate(GROUND, replace(wanted, method=place("Brake"), episodes=1))
     assert braked["failsafes"] == braked["steps"] and braked["mean_speed"] < 0.01
+    seen = evaluate(GROUND, replace(wanted, method=place("ByRays"), episodes=1))
+    assert seen["interventions"] == 0 < seen["steps"]
     assert figures["model"] == method_for(GROUND, place("Half"), ModelConfig()).version
 
 
 def test_a_comparison_trains_an_own_filter_and_notices_a_change_of_its_file(
-    data_folder: Path, tmp_path: Path, place: Callable[[str], str]
+    data_folder: Path, tmp_path: Path, place: Callable[[str], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     td3 = replace(CellConfig("ground", "none", 0, 1, 1).td3, hidden=(16, 16), batch=16, warmup=40)
     compare = CompareCommand(
-        *(("ground",), (0,), 1500, 1, ("default",), ("none", place("Half"))),
+        *(("ground",), (0,), 1500, 1, ("default",), ("none", place("ByRays"))),
         **{"at_once": 4, "conservatism": False, "td3": td3, "quiet": True},
         **{"results": tmp_path / "results", "runs": tmp_path / "runs"},
     )
     assert compare.run() == 0
-    cell = json.loads((tmp_path / "results/ground/Half-s0.json").read_text())
-    assert cell["evaluations"].keys() == {"trained-Half-default"} and cell["study"]["code"] == cell["model"]["version"]
-    assert (tmp_path / "runs/ground/Half-s0/training.mcap").exists()
+    cell = json.loads((tmp_path / "results/ground/ByRays-s0.json").read_text())
+    assert (
+        cell["evaluations"].keys() == {"trained-ByRays-default"} and cell["study"]["code"] == cell["model"]["version"]
+    )
+    assert (tmp_path / "runs/ground/ByRays-s0/training.mcap").exists()
+    assert "2 of 2 results are stored" not in capsys.readouterr().err and compare.run() == 0
+    assert "2 of 2 results are stored in" in capsys.readouterr().err
     page = (tmp_path / "results/README.md").read_text()
-    assert "| Half | 1 | TD3 | the arena's map | code of its own | 0 |" in page
-    (tmp_path / "halves.py").write_text(HALF.replace("0.5", "0.7"))
+    assert "| ByRays | 1 | TD3 | the observed rays | code of its own | 0 |" in page
+    (tmp_path / "halves.py").write_text(HALF.replace("18", "18.0"))
     with pytest.raises(ResultError, match="another code"):
         compare.run()
 
