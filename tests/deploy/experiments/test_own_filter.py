@@ -128,10 +128,15 @@ def test_a_model_in_a_file_never_names_code_to_run(data_folder: Path, place: Cal
         ready(received)
 
 
-def test_the_example_of_the_page_stops_before_obstacles_that_the_greedy_policy_hits(data_folder: Path) -> None:
+def test_the_example_of_the_page_stops_before_obstacles_that_the_greedy_policy_hits(
+    data_folder: Path, tmp_path: Path
+) -> None:
     root = Path(__file__).parents[3]
     example = root / "examples/own_filter.py"
-    (code,) = re.findall(r"```python\n(.*?)```", (root / "docs/rivals.md").read_text(), re.DOTALL)
+    code, by_rays = re.findall(r"```python\n(.*?)```", (root / "docs/rivals.md").read_text(), re.DOTALL)
     assert code in example.read_text(), "the page shows the file"
+    (tmp_path / "rays.py").write_text("from brakeline import OwnFilter\n\n" + by_rays)
+    stopped = evaluate(GROUND, Evaluation("greedy", f"{tmp_path}/rays.py:StopByRays", episodes=4))
+    assert stopped["collisions"] == 0 < stopped["failsafes"]
     wanted = Evaluation("greedy", f"{example}:SpeedLimit", episodes=8)
     assert evaluate(GROUND, wanted)["collisions"] == 0 < evaluate(GROUND, replace(wanted, method="none"))["collisions"]
