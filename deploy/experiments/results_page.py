@@ -319,16 +319,16 @@ the other method. It does not mean that this is certain: if two methods were equ
 like this in 1 of 126 comparisons.
 """
 TUNING = """\
-Every rival but TD3 tries four values of one setting, in episodes that evaluate nothing else. A filter trains nothing:
-it drives 120 episodes with A* and 120 with a greedy policy. Of the values with which A* reaches the most goals, the
-best has the fewest collisions of the greedy policy, then the most of its goals, then the fewest interventions on A*. A
-learner trains once, from a seed of its own, and drives 120 episodes. Of the values that reach at most 6 goals (5 % of
-the episodes) fewer than the value with the most, the best has the fewest collisions. Behind our filter, SAC is not
-tuned. The clearance margin of ours follows from its model set. The penalty for corrections is 1, in the air 12 for the
-filters that know the map:
-it was chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from
-trainings of ours from seeds 0 and 1 (`docs/results_quadrotor.md`). The other settings of TD3 are the same for all
-methods, and were chosen on ours (`deploy/experiments/experiments.md`).
+Every rival but TD3 tries four values of one setting (TD3-Lagrange six: the best of the first four was the smallest), in
+episodes that evaluate nothing else. A filter trains nothing: it drives 120 episodes with A* and 120 with a greedy
+policy. Of the values with which A* reaches the most goals, the best has the fewest collisions of the greedy policy,
+then the most of its goals, then the fewest interventions on A*. A learner trains once, from a seed of its own, and
+drives 120 episodes. Of the values that reach at most 6 goals (5 % of the episodes) fewer than the value with the most,
+the best has the fewest collisions. Behind our filter, SAC is not tuned. The clearance margin of ours follows from its
+model set. The penalty for corrections is 1, in the air 12 for the filters that know the map: it was chosen from 1, 4,
+12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from trainings of ours from seeds 0
+and 1 (`docs/results_quadrotor.md`). The other settings of TD3 are the same for all methods, and were chosen on ours
+(`deploy/experiments/experiments.md`).
 """
 THREATS = """## Threats to validity
 
@@ -342,9 +342,10 @@ THREATS = """## Threats to validity
   simulated robots well.
 - **Recorded periods** come before the training, and no count of training steps contains them. With them, a method that
   learns from a recording may need more periods of driving than one without.
-- **Tuning.** Each rival tuned one setting over four values, in `default`. Penalty, its growth and imitation were chosen
-  on trainings of ours whose seeds are in the table. More tuning may help every method, also ours. Where the
-  best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from one seed.
+- **Tuning.** Each rival tuned one setting over four values (TD3-Lagrange six), in `default`. Penalty, its growth and
+  imitation were chosen on trainings of ours whose seeds are in the table. More tuning may help every method, also ours.
+  Where the best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from
+  one seed.
 - **Rooms.** The trainings that chose penalty, its growth, imitation and turning aside were evaluated in rooms of the
   tables (the first 200 or all 500 of an arena), and the rivals' values in other rooms. This favours ours. The campaigns
   (`docs/campaigns.md`) drive the stored policies in 10,000 rooms of each arena, which contain these 500.

@@ -1,8 +1,8 @@
 """Tune one setting of every rival with the same budget, as jobs whose results the results page lists.
 
-Each rival tries four values. Among the values of a filter with which A* reaches the most goals, choose the one with the
-fewest collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy,
-then by the interventions on A*. The results are the `rivals` of the task files.
+Each rival tries four values, TD3-Lagrange six. Among the values of a filter with which A* reaches the most goals,
+choose the one with the fewest collisions of the greedy policy, which drives straight to the goal. Break ties by the
+goals of the greedy policy, then by the interventions on A*. The results are the `rivals` of the task files.
 
 A learner trains once with each value, from a seed that no comparison uses, and drives 120 episodes in the first
 arena. Among the values whose goals come within `NEARLY` of the most, its best one has the fewest collisions, then the
@@ -36,7 +36,7 @@ EPISODES = 120  # of a learner, and of each of the two policies that try a filte
 SEED_KEY = 2_000_000  # of the episodes of the tunings, which no training and no evaluation has
 NEARLY = 0.05  # of the episodes
 SETTINGS: dict[str, tuple[str, tuple[float, ...]]] = {  # of learners: field of `TD3Config`, values
-    "lagrange": ("multiplier_rate", (1.0, 3.0, 10.0, 30.0)),
+    "lagrange": ("multiplier_rate", (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)),
     "sac": ("actor_rate", (1e-4, 3e-4, 1e-3, 3e-3)),
 }
 
