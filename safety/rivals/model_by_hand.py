@@ -30,6 +30,12 @@ def follows_velocities(robot: Robot) -> bool:
     return d > 1 and moves and not robot.feedback and not robot.late
 
 
+def check_standing_map(method: str, request: Request) -> None:
+    """Raise BadRequest if a request has a scan or moving obstacles: a method that ignores them takes them as free."""
+    if request.scan is not None or (request.movers is not None and len(request.movers)):
+        raise BadRequest("obstacles", f"{method} decides among standing obstacles of a map alone")
+
+
 class RivalByHand(Rival):
     """A method with equations of motion by hand, and the method's settings."""
 
@@ -62,8 +68,7 @@ class RivalByHand(Rival):
                 obstacles. It has the field's name.
         """
         check_for_filter(self.robot, request)
-        if request.scan is not None or (request.movers is not None and len(request.movers)):
-            raise BadRequest("obstacles", f"{self.model.method} decides among standing obstacles of a map alone")
+        check_standing_map(self.model.method, request)
         for name in ("center", "axes", "half", "rho", "round", "margin"):
             if not np.isfinite(getattr(request.obstacles, name)).all():
                 raise BadRequest("obstacles", f"obstacles: {name} holds NaN or infinity")

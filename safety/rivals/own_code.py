@@ -19,6 +19,7 @@ from brakeline.messaging.task import needs_task
 from brakeline.messaging.task_code import load_code
 from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request, check_for_filter
+from brakeline.safety.rivals.model_by_hand import check_standing_map
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.rival import Rival
 
@@ -28,6 +29,8 @@ class OwnFilter(Rival):
 
     Attributes:
         obstacles: what your filter knows of them, in the words of the results page.
+        standing_map: whether requests with a scan or moving obstacles are refused, because `request.obstacles` has
+            neither. A filter that reads `request.scan`, `request.movers` or the rays alone sets it to False.
 
     >>> class Half(OwnFilter):
     ...     def safe_input(self, request, proposal):
@@ -35,6 +38,7 @@ class OwnFilter(Rival):
     """
 
     obstacles = "the arena's map"
+    standing_map = True
 
     @property
     def rays(self) -> LidarRays:
@@ -56,8 +60,10 @@ class OwnFilter(Rival):
         """
 
     def check(self, request: Request) -> None:
-        """Check a request as our filter does. Raises BadRequest, with the field's name."""
+        """Check a request as our filter does. Raises BadRequest, with the field's name; see also `standing_map`."""
         check_for_filter(self.robot, request)
+        if self.standing_map:
+            check_standing_map(self.model.method, request)
 
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
         """Return the decision with the filter's input, within bounds and slew. Raises BadInput: it returned none."""

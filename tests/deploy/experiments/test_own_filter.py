@@ -19,6 +19,7 @@ from brakeline.safety.methods import decode, ready
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.rivals.own_code import OwnCode
 from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.sim.sim_conditions import Conditions, Perception
 from tests.robots import GROUND
 
 HALF = """
@@ -42,6 +43,12 @@ class ByRays(OwnFilter):
         distance = request.obstacles.distance(request.state[:2]).min()
         assert distance < nearest + 0.1, "no ray goes through an obstacle"
         return proposal
+
+class Sees(OwnFilter):
+    standing_map = False
+
+    def safe_input(self, request, proposal):
+        assert request.scan is not None and not len(request.obstacles)
 
 class Short(OwnFilter):
     def safe_input(self, request, proposal):
@@ -112,6 +119,10 @@ def test_what_is_no_filter_is_refused_with_the_reason(data_folder: Path, place: 
         make("Quarter")
     with pytest.raises(BadModel, match=r"return 2 finite numbers \(speed"):
         evaluate(GROUND, Evaluation("greedy", place("Short"), episodes=1))
+    scan = Conditions(perception=Perception("scan"))
+    with pytest.raises(BadModel, match="decides among standing obstacles of a map alone"):  # which would be empty
+        evaluate(GROUND, Evaluation("greedy", place("Brake"), episodes=1, conditions=scan))
+    assert evaluate(GROUND, Evaluation("greedy", place("Sees"), episodes=1, conditions=scan))["steps"] > 0
     with pytest.raises(BadModel, match="lacks the method"):  # before the first training
         CompareCommand(("ground",), methods=("none", place("Unwritten")), runs=Path("/dev/null/no")).run()
     with pytest.raises(ValueError, match="tuning knows settings of the rivals"):
