@@ -15,6 +15,7 @@ from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
 from brakeline.logs.stacking_table import plain_table
+from brakeline.messaging.task import STUDIED
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.campaign import CampaignPart
@@ -29,7 +30,7 @@ class CampaignCommand:
 
     robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Drive these robots."""
-    arenas: tuple[str, ...] = ("default", "dense")
+    arenas: tuple[str, ...] = STUDIED
     """Drive in arenas of these names. A robot of your own without an arena of the name dense drives in default."""
     policies: tuple[str, ...] = ("trained", "random", "adversary")
     """Drive by these policies, as `brakeline evaluate` names them."""

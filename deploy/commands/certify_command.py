@@ -155,7 +155,7 @@ class CertifyCommand:
             return {"not_used": refused}
         if not self.use:
             return {}
-        from brakeline.deploy.run.run_keys import put_to_use
+        from brakeline.deploy.data.model_store import put_to_use
 
         return {"in_use": str(put_to_use(model, data, self.endpoints.keys or options.default_keys()))}
 

@@ -75,8 +75,8 @@ class CollectCommand:
 
     def _first_flight(self) -> int:
         from brakeline.deploy.data.data_paths import record_path
+        from brakeline.deploy.data.model_store import put_to_use
         from brakeline.deploy.run.first_flight_run import fly
-        from brakeline.deploy.run.run_keys import put_to_use
         from brakeline.messaging.task import robot_maybe_with_task
         from brakeline.safety.model.stated_bound import accepted_bound, refusal
 

@@ -1,4 +1,4 @@
-"""Load the models that a robot uses, and build those that are missing.
+"""Load the models that a robot uses, build those that are missing, and put a model set to use.
 
 Simulators, PyTorch and SciPy's statistics are imported only where a model is built. A service that finds its model
 saves seconds and hundreds of megabytes.
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from brakeline.deploy.data.build_lock import folder_lock
-from brakeline.deploy.data.data_paths import method_path, model_path, record_path
+from brakeline.deploy.data.data_paths import method_path, model_path, note_mode, record_path
 from brakeline.deploy.data.recording_origin import outdated
 from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
@@ -31,6 +31,7 @@ from brakeline.safety.rivals.pretrained import NOT_PRETRAINED, Pretrained
 
 if TYPE_CHECKING:
     from brakeline.deploy.data.rival_pretraining import RivalConfig
+    from brakeline.safety.model.dataset import Dataset
 
 M = TypeVar("M")
 
@@ -64,6 +65,26 @@ def model_for(
     check_bound(model, robot, accept_bound)
     limit = robot.accept_bound  # of today's description, not of the description at certification
     return replace(model, robot=replace(model.robot, accept_bound=limit))
+
+
+def put_to_use(model: ModelSet, data: Dataset, keys: Path | None) -> Path:
+    """Write a model set to the path from which other commands load it, and return the path.
+
+    Args:
+        model: the model set.
+        data: the data set that it was fitted to.
+        keys: folder of keys. If it holds the signing key, the model set is signed.
+    """
+    from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
+
+    path = model_path(model.robot, model.model_config)
+    seal_of(path).unlink(missing_ok=True)  # the seal of the model set before
+    if keys is not None and (keys / KEY).exists():
+        ModelSigner.load(keys).sign(model, data).save(path)
+    else:
+        model.save(path)
+    note_mode(model.robot, model.model_config)
+    return path
 
 
 def _load_or_build(path: Path, load: Callable[[], M], build: Callable[[], M], activity: str) -> M:

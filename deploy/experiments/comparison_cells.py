@@ -30,6 +30,7 @@ from brakeline.deploy.experiments.compared_methods import (
 from brakeline.deploy.experiments.experiment_jobs import task_hash
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
+from brakeline.messaging.task import STUDIED
 from brakeline.safety.model.model_config import AUTO, DDPC, SAILR, SECAS, ModelConfig
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ class CellConfig:
     seed: int
     steps: int
     episodes: int
-    arenas: tuple[str, ...] = ("default", "dense")  # for the evaluation; training uses the first
+    arenas: tuple[str, ...] = STUDIED  # for the evaluation; training uses the first
     penalty: float = 1.0  # for corrections
     model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)

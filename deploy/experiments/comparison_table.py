@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio
-from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order, short_name
+from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order
+from brakeline.deploy.experiments.comparison_cells import TrialConfig
 from brakeline.deploy.experiments.episode_table import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.messaging.robot import Array
@@ -77,8 +78,8 @@ def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:
 
 
 def evaluation_name(method: str, arena: str) -> str:
-    """Return the name of the evaluation of a method's policies behind its own filter, as `TrialConfig.name` has it."""
-    return f"{TRAINED}-{short_name(compared(method).filter)}-{arena}"
+    """Return the name of the evaluation of a method's policies behind its own filter."""
+    return TrialConfig(TRAINED, compared(method).filter, arena, 0).name
 
 
 def evaluation_rows(results: Sequence[Result], trial: str) -> Row:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from brakeline.deploy.data.data_paths import model_path, note_mode
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.deploy.run.run_models import model_in_run
@@ -12,10 +11,9 @@ from brakeline.errors import Untrusted
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import Model, archive_path, load
-from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelSet
 from brakeline.safety.service.plan_token import write_key
-from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, seal_of, write_signer
+from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, write_signer
 
 KEYS = "keys"  # folder in the run's folder
 OTHER_ROLES = ("launcher", "viewer", "client", "certify")  # that may join the bus, besides the run's processes
@@ -48,18 +46,6 @@ def sign_models(config: RunConfig, folder: Path, keys: Path) -> None:
             trust.load_model(archived)
         except Untrusted:  # it has no seal yet, or not a whole one
             signer.sign(model).save(archived)
-
-
-def put_to_use(model: ModelSet, data: Dataset, keys: Path | None) -> Path:
-    """Write a model set to the path, which is returned, where other commands load it. If `keys` can sign, sign it."""
-    path = model_path(model.robot, model.model_config)
-    seal_of(path).unlink(missing_ok=True)  # that of the model set before
-    if keys is not None and (keys / KEY).exists():
-        ModelSigner.load(keys).sign(model, data).save(path)
-    else:
-        model.save(path)
-    note_mode(model.robot, model.model_config)
-    return path
 
 
 def check_signer(keys: Path | None) -> None:

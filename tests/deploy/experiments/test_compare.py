@@ -200,7 +200,9 @@ def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
     text, figures = markdown(rows), json.dumps(plain(rows))
     assert "| ours, n = 1 | SAILR, n = 1 | SECAS, n = 1 | TD3, n = 1 |" in text
     assert all(word in text for word in ("*paper*", "## training", "## default", "## deployment", "*80.4*"))
-    assert "decision [ms]" in text and "goal rate" in figures
+    assert "decision [ms]" in text and "goal rate" in figures and "--quick" not in text
+    short = markdown(rows, quick=True)
+    assert "A test of the code (`--quick`), no result" in short and "| *paper* |" not in short
     learning_curves(singles, tmp_path / "curves.png")
     seeds_as_points(rows, tmp_path / "seeds.png")
     assert (tmp_path / "curves.png").stat().st_size > 10_000 < (tmp_path / "seeds.png").stat().st_size
