@@ -1,4 +1,4 @@
-"""A safety filter of your own, which `evaluate` and `compare` take like the rivals: the nearer, the slower.
+"""A safety filter of your own for `evaluate` and `compare`. It limits the speed near obstacles.
 
 brakeline evaluate ground --policy greedy --method examples/own_filter.py:SpeedLimit
 brakeline compare ground --methods ddpc examples/own_filter.py:SpeedLimit --seeds 0 --results results/mine

@@ -94,7 +94,10 @@ class CertifyCommand:
             for row in (row for modes in results.values() for row in modes.values() if "in_use" in row):
                 console.print(f"{row['in_use']}: in use from now on", markup=False)
                 if self.accept_bound is not None:
-                    console.print("the other commands refuse it unless they have the same --accept-bound", markup=False)
+                    console.print(
+                        "other commands refuse this model set unless you give them the same --accept-bound",
+                        markup=False,
+                    )
             if self.verbose:
                 console.print(conditions_table(data.about))
         if self.publish and models and not self._refusal(models[0][0], data):

@@ -63,7 +63,7 @@ class CompareCommand:
     your own without an arena of the name dense is evaluated in default alone."""
     methods: tuple[str, ...] | None = None
     """Compare these methods. Defaults to all that the robot and the arenas allow. FILE.py:CLASS is a filter of your own
-    (see docs/rivals.md): give another --results folder with it."""
+    (see docs/rivals.md). Give another --results folder with it."""
     backend: Literal["single", "batch"] | None = None
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""
@@ -138,10 +138,10 @@ class CompareCommand:
         return 0
 
     def _say_stored(self, robot: str, jobs: Sequence[Job], results: Path) -> None:
-        """Print how many results are stored already, before nothing happens for minutes."""
+        """Print how many results are stored: if all are, the tables take a minute without further output."""
         if jobs and not (self.again or self.quick):
             stored = sum(read(results, job) is not None for job in jobs)
-            advice = ": --again makes them anew, another --results folder makes others" if stored else ""
+            advice = ". To train anew, give --again, or another --results folder" if stored else ""
             say(robot, f"{stored} of {len(jobs)} results are stored in {results}{advice}")
 
     def _check_options(self) -> None:

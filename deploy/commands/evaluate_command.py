@@ -23,8 +23,8 @@ class EvaluateCommand:
     robot: options.Robot = "ground"
     policy: str = "astar"
     """Evaluate this policy: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
-    astar, careful (astar far from obstacles), the folder of a run, a weights file, FILE.py:CLASS, or a CSV
-    file of inputs as `brakeline excite` prints them."""
+    astar, careful (astar far from obstacles), the folder of a run, a weights file, FILE.py:NAME (a class or a
+    function of your own), or a CSV file of inputs as `brakeline excite` prints them."""
     filtering: options.Unprefixed[options.EvaluatedFilter] = field(default_factory=options.EvaluatedFilter)
     physics: options.Unprefixed[options.SimulationOptions] = field(default_factory=options.SimulationOptions)
     arena: options.ArenaName = "default"

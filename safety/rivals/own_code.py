@@ -28,9 +28,9 @@ class OwnFilter(Rival):
     """Derive your filter from this class, and write `safe_input`. `self.robot` has inputs, bounds, period and body.
 
     Attributes:
-        obstacles: what your filter knows of them, in the words of the results page.
-        standing_map: whether requests with a scan or moving obstacles are refused, because `request.obstacles` has
-            neither. A filter that reads `request.scan`, `request.movers` or the rays alone sets it to False.
+        obstacles: how your filter gets obstacles, as the results page states it.
+        standing_map: True to refuse requests with a scan or moving obstacles, which `request.obstacles` does not
+            contain. Set it to False in a filter that reads `request.scan`, `request.movers` or the rays.
 
     >>> class Half(OwnFilter):
     ...     def safe_input(self, request, proposal):
@@ -46,7 +46,7 @@ class OwnFilter(Rival):
         return needs_task(self.robot).task.rays
 
     def ranges(self, request: Request) -> Array:
-        """Return the distances [m] that the rays measure (R,); one that meets nothing measures the largest range."""
+        """Return the distances [m] that the rays measure (R,). A ray that hits nothing measures the largest range."""
         return np.asarray(request.observation[: len(self.rays.directions)], dtype=float) * self.rays.range
 
     @abstractmethod
@@ -66,7 +66,7 @@ class OwnFilter(Rival):
             check_standing_map(self.model.method, request)
 
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
-        """Return the decision with the filter's input, within bounds and slew. Raises BadInput: it returned none."""
+        """Return the decision with the filter's input, within bounds and slew. Raises BadInput: it is no input."""
         returned = self.safe_input(request, proposal.copy())
         if returned is None:
             return self.braking(request, started, "the filter brakes")
@@ -93,7 +93,7 @@ class OwnCode(Pretrained):
             raise BadModel(f"{path}: {error}") from error
 
     def encode(self) -> bytes:
-        """Raise BadModel: nobody who gets a model runs code that it names."""
+        """Raise BadModel: a file of a model must not name code to run."""
         raise BadModel(f"{self.method} is code of your own, which no file of a model can hold")
 
     def ready(self) -> OwnFilter:
