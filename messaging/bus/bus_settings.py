@@ -38,7 +38,9 @@ class BusSettings:
         connect: endpoints of routers. A client uses the first one that answers, and reconnects by itself later.
         listen: endpoints at which the process is a router.
         patience: time to wait for a router at the start [s].
-        lease: time after which a silent peer counts as gone [s].
+        lease: time after which a peer that says nothing counts as gone [s]. On a busy machine a process may get no
+            processor time for seconds, and a recorder must not lose what was published meanwhile.
+        query_lease: the same for a client that asks or answers queries [s]: another service answers in its place.
         stall: time for which a publisher waits for a receiver that reads nothing, before it closes the link [s].
         keys: folder with the keys (messaging/bus/certificate_authority.py).
         metrics: PORT or HOST:PORT at which the process serves its metrics; empty: it serves none.
@@ -48,7 +50,8 @@ class BusSettings:
     listen: tuple[str, ...] = ()
     prefix: str = "brakeline"
     patience: float = 10.0
-    lease: float = 1.5
+    lease: float = 5.0
+    query_lease: float = 1.5
     stall: float = 1.0
     keys: Path | None = None
     insecure: bool = False
@@ -101,8 +104,11 @@ def local(endpoint: str) -> bool:
         return host == "localhost"
 
 
-def configuration(settings: BusSettings, source: str) -> zenoh.Config:
+def configuration(settings: BusSettings, source: str, lease: float | None = None) -> zenoh.Config:
     """Return the Zenoh configuration of a session of the process `source`.
+
+    Args:
+        lease: time of silence after which the other end closes the link [s]; None: that of the settings.
 
     Raises:
         ValueError: see `BusSettings.check`.
@@ -123,7 +129,7 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
         "transport/unicast/accept_timeout": int(AUTHENTICATION_TIME * 1e3),
         "transport/unicast/max_sessions": MOST_SESSIONS,
         "transport/link/rx/max_message_size": 2 * FILE,
-        "transport/link/tx/lease": int(settings.lease * 1e3),
+        "transport/link/tx/lease": int((lease or settings.lease) * 1e3),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": int(settings.stall * 1e6),
     }
     if settings.keys is not None:
@@ -135,8 +141,8 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
     return zenoh_config(values)
 
 
-def open_session(settings: BusSettings, source: str) -> zenoh.Session:
-    """Open a session of the process `source`.
+def open_session(settings: BusSettings, source: str, lease: float | None = None) -> zenoh.Session:
+    """Open a session of the process `source`; lease: see `configuration`.
 
     Raises:
         Unreachable: no router answered, or the process cannot listen on an endpoint.
@@ -146,7 +152,7 @@ def open_session(settings: BusSettings, source: str) -> zenoh.Session:
     pause = FIRST_PAUSE
     while True:
         try:
-            return zenoh.open(configuration(settings, source))
+            return zenoh.open(configuration(settings, source, lease))
         except zenoh.ZError as error:
             left = until - time.monotonic()
             if left <= 0.0:

@@ -60,9 +60,10 @@ class Bus:
         self._subscriptions: list[ReceiverThreads] = []
         self._telemetry = open_session(settings, source)
         # A router is one session; the two links of each client end in it separately.
-        self._queries = self._telemetry if settings.listen else open_session(settings, source)
+        self._queries = self._telemetry if settings.listen else open_session(settings, source, settings.query_lease)
         self._query_client = QueryClient(self._queries)
-        self._token = self._telemetry.liveliness().declare_token(self._full(ALIVE.format(source=source)))
+        # Of the session with the short lease: a process that hangs soon counts as gone.
+        self._token = self._queries.liveliness().declare_token(self._full(ALIVE.format(source=source)))
 
     def __enter__(self) -> Self:
         return self
@@ -193,7 +194,7 @@ class Bus:
     def living(self) -> frozenset[str]:
         """Return the names of the processes that are alive now, with this one."""
         key = self._full(ALIVE.format(source="*"))
-        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(key, timeout=1.0)
+        replies: Iterable[zenoh.Reply] = self._queries.liveliness().get(key, timeout=1.0)
         names = (str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
         return frozenset(name for name in names if NAME.fullmatch(name))
 

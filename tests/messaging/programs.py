@@ -28,6 +28,20 @@ print("ready", flush=True)
 time.sleep(60)
 """
 
+LISTENER = """
+import time
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.topics import LOG
+heard = []
+bus = Bus(BusSettings(connect=("{endpoint}",)), "recorder")
+bus.subscribe(LOG, lambda sample: heard.append(sample.message().header.sequence))
+print("ready", flush=True)
+until = time.monotonic() + 20.0
+while len(heard) < {lines} and time.monotonic() < until:
+    time.sleep(0.05)
+print("complete" if heard == list(range(1, {lines} + 1)) else heard, flush=True)
+"""
+
 
 def answers(bus: Bus, payload: bytes = b"?", timeout: float = 0.5) -> bytes | None:
     try:

@@ -17,7 +17,7 @@ from brakeline.messaging.bus.subscription import Listener
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import BUNDLE, BUNDLED, DECIDE, EPISODE, EXCHANGE, HEALTH, LOG, STEP, WEIGHTS
-from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers
+from tests.messaging.programs import LISTENER, ROUTER, SERVICE, Join, Spawn, answers
 from tests.waiting import until
 
 
@@ -113,6 +113,22 @@ def test_who_lives_is_known_and_who_is_stopped_or_killed_is_missed(
         if number is signal.SIGSTOP:
             child.send_signal(signal.SIGCONT)
             until(lambda: "safety-a" in router.living())
+
+
+def test_a_listener_that_gets_no_time_for_seconds_misses_nothing(join: Join, spawn: Spawn, endpoint: str) -> None:
+    """As on a busy machine. Its link was closed after 1.5 s, and a recorder lost what was published meanwhile."""
+    lines = 60
+    join("launcher", listen=True)
+    publisher = join("actor-0").publisher(LOG)
+    listener = spawn(LISTENER.format(endpoint=endpoint, lines=lines))
+    time.sleep(0.5)  # until the publisher knows it
+    for number in range(lines):
+        if number == 5:
+            listener.send_signal(signal.SIGSTOP)
+        publisher.put(pb.LogLine(text="a line"))
+        time.sleep(0.05)
+    listener.send_signal(signal.SIGCONT)
+    assert listener.stdout is not None and listener.stdout.readline() == "complete\n"
 
 
 def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
