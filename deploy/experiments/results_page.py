@@ -160,7 +160,7 @@ def _settings_of(method: ComparedMethod, study: dict[str, Any], symmetric: bool)
     names = ("actor_rate",) if sac else RATES
     settings = [f"{'learning rate' if sac else name} {td3[name]}" for name in names if name in td3]
     if symmetric:
-        settings.append("learns from mirrored steps" if td3.get("symmetric") and not sac else "no mirrored steps")
+        settings.append("learns from mirrored steps" if td3.get("symmetric") else "no mirrored steps")
     settings += [f"{name} {td3[name]:g}" for name in method.td3 if name in td3 and name not in RATES]
     if method.filter != NONE:
         settings.append(f"penalty for corrections {study.get('penalty', 1.0):g}")

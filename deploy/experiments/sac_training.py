@@ -1,8 +1,8 @@
 """Train Stable-Baselines3's SAC (Haarnoja et al. 2018) from many robots at once, with or without a filter.
 
 The learner sees what any user of `BatchSafetyWrapper` has: its own proposal as the action, and the reward less the
-penalty for a correction. Rewards have the scale that our TD3 gives them. The deterministic policy is a network as ours,
-so that the same evaluations drive it.
+penalty for a correction. Rewards have the scale that our TD3 gives them, and batches hold the images of steps that ours
+have (learner/symmetry.py). The deterministic policy is a network as ours, so that the same evaluations drive it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 
 from brakeline.actors.episode_runner import ActorIdentity
@@ -20,12 +22,34 @@ from brakeline.deploy.batch_robots import BatchRobots
 from brakeline.deploy.experiments.comparison_cells import CellConfig
 from brakeline.deploy.experiments.trials import Begin, Take
 from brakeline.deploy.run.batch_trainer import actor_names
+from brakeline.learner.learner_config import TD3Config
+from brakeline.learner.symmetry import SymmetryAugmentation
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.sim.navigation_env import action_and_observation_space
 
 CAPACITY = 200_000  # steps of the replay buffer, as our learner's
+
+
+class ImagesReplayBuffer(NStepReplayBuffer):
+    """The n-step buffer of Stable-Baselines3, whose batches hold the images of steps in a turned or mirrored world.
+
+    Its actions are in shares of their ranges. Axes that change places have equal ranges, and none that changes its sign
+    has another range to its other side. So the images of these are the shares of the images.
+    """
+
+    def __init__(self, *args: Any, images: SymmetryAugmentation, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._images = images
+
+    def _get_samples(self, batch_inds: NDArray[np.intp], env: Any = None) -> ReplayBufferSamples:
+        samples = super()._get_samples(batch_inds, env)
+        turned = ("observations", "actions", "next_observations")
+        return samples._replace(**{name: self._image(getattr(samples, name)) for name in turned})
+
+    def _image(self, rows: torch.Tensor) -> torch.Tensor:
+        return torch.as_tensor(self._images.rows(rows.numpy()))
 
 
 class RobotsAsVecEnv(VecEnv):
@@ -107,11 +131,11 @@ def train_sac(
             env,
             learning_rate=config.actor_rate,
             buffer_size=CAPACITY,
+            **_buffer(robot, config),
             learning_starts=config.warmup,
             batch_size=config.batch,
             tau=config.tau,
             gamma=config.gamma,
-            n_steps=config.n_step,
             gradient_steps=max(1, round(config.updates_per_step * cell.robots)),  # for one step of each robot
             policy_kwargs={"net_arch": list(config.hidden)},
             seed=cell.seed,
@@ -121,6 +145,15 @@ def train_sac(
     finally:
         env.close()
     return MLP(robot, _layers(model)), int(model._n_updates)
+
+
+def _buffer(robot: RobotWithTask, config: TD3Config) -> dict[str, Any]:
+    """Return the options of SAC for n-step returns, and for images of steps if our learner has them."""
+    if not config.symmetric or robot.task.symmetry == "none":
+        return {"n_steps": config.n_step}
+    images = SymmetryAugmentation(robot, config.batch)
+    options = {"n_steps": config.n_step, "gamma": config.gamma, "images": images}
+    return {"replay_buffer_class": ImagesReplayBuffer, "replay_buffer_kwargs": options}
 
 
 def _layers(model: SAC) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:

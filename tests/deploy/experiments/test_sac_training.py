@@ -5,10 +5,13 @@ import pytest
 from stable_baselines3 import SAC
 
 from brakeline.deploy.batch_robots import BatchRobots
-from brakeline.deploy.experiments.sac_training import RobotsAsVecEnv, _layers
+from brakeline.deploy.experiments.sac_training import RobotsAsVecEnv, _buffer, _layers
+from brakeline.learner.learner_config import TD3Config
+from brakeline.learner.symmetry import symmetry_maps, symmetry_matrices
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.filter import Filter
+from brakeline.sim.navigation_env import action_and_observation_space
 
 GROUND = robot_with_task("ground")
 
@@ -46,3 +49,33 @@ def test_it_learns_from_its_proposals_and_pays_for_corrections(env):
         corrected += sum(step.penalty > 0.0 for step in steps)
         assert not any(step.collision for step in steps)
     assert corrected > 0
+
+
+def test_in_the_air_it_learns_from_the_images_of_steps_that_our_learner_has():
+    robot = robot_with_task("quadrotor")
+    action_space, observation_space = action_and_observation_space(robot)
+    assert np.array_equal(action_space.low, -action_space.high) and action_space.high[0] == action_space.high[1]
+    options = _buffer(robot, TD3Config(batch=16))
+    assert "n_steps" not in options, "Stable-Baselines3 ignores it beside a buffer, which has its own"
+    make = options["replay_buffer_class"]
+    buffer = make(64, observation_space, action_space, device="cpu", n_envs=1, **options["replay_buffer_kwargs"])
+    rng = np.random.default_rng(0)
+    seen = rng.uniform(0.1, 0.9, (40, robot.task.observation_dim)).astype(np.float32)
+    taken = rng.uniform(-1.0, 1.0, (40, robot.action_dim)).astype(np.float32)
+    for k in range(39):
+        buffer.add(seen[k : k + 1], seen[k + 1 : k + 2], taken[k : k + 1], np.ones(1), np.zeros(1), [{}])
+
+    rows = np.arange(16)
+    batch = buffer._get_samples(rows)
+    turns = symmetry_matrices(robot)
+    for k in rows:
+        rays, observed, axes, acted = symmetry_maps(robot, turns[k % len(turns)])
+        assert np.array_equal(batch.observations[k], (seen[k][rays] * observed).astype(np.float32))
+        assert np.array_equal(batch.actions[k], (taken[k][axes] * acted).astype(np.float32))
+        assert np.array_equal(batch.next_observations[k], (seen[k + 3][rays] * observed).astype(np.float32))
+    assert batch.rewards.numpy() == pytest.approx(1.0 + 0.99 + 0.99**2) and len(turns) == 8
+
+
+@pytest.mark.parametrize(("robot", "symmetric"), [("ground", True), ("quadrotor", False)])
+def test_without_images_the_buffer_is_that_of_stable_baselines(robot, symmetric):
+    assert _buffer(robot_with_task(robot), TD3Config(symmetric=symmetric)) == {"n_steps": 3}
