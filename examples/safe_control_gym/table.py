@@ -1,4 +1,4 @@
-"""Add up the lines that `run.py` wrote, as the table of docs/environments.md. python table.py *.jsonl"""
+"""Add up the lines that `run.py` wrote, as the table of docs/other_environments.md. python table.py *.jsonl"""
 
 from __future__ import annotations
 

@@ -37,8 +37,8 @@ def test_the_filter_ends_the_collisions_of_a_policy_that_knows_no_obstacles():
 
 
 def test_the_page_about_environments_changes_a_task():
-    page = (EXAMPLES.parent / "docs" / "environments.md").read_text()
-    code = page.partition("### Change the task")[2].partition("```python\n")[2].partition("```")[0]
+    page = (EXAMPLES.parent / "docs" / "own_environments.md").read_text()
+    code = page.partition("## Change the task")[2].partition("```python\n")[2].partition("```")[0]
     ground, air = code.partition("windy = ")[::2]
     names: dict[str, object] = {}
     exec(ground, names)

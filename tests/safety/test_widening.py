@@ -270,7 +270,7 @@ def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
 
 
 def test_episodes_behind_the_filter_repeat_once_the_widening_is_forgotten():
-    """As docs/environments.md says: the scores of earlier episodes widen the sets of this one."""
+    """As docs/own_environments.md says: the scores of earlier episodes widen the sets of this one."""
     env = SafetyWrapper(NavigationEnv(GROUND, "dense"), Filter.load("ground"))
 
     def executed(number, forget):
