@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import UNSTATED, describe_verification, percent, valid_bound
 
@@ -57,7 +58,7 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
         return None
     proposed, executed = np.array(request.action), np.array(decision.plan[: robot.action_dim])
     heading = 0.0 if robot.heading is None else request.state[robot.heading]
-    names = [split(label) for label in robot.action]
+    names = [split_label(label) for label in robot.action]
     limited = ""
     if decision.kind == pb.ALLOWED:
         limited = limits_applied(robot, proposed, np.array(request.input_in_force), executed)
@@ -110,12 +111,6 @@ def bound_in(decision: pb.Decision) -> float | None:
     return valid_bound(decision.bound) if decision.HasField("bound") else None
 
 
-def split(label: str) -> tuple[str, str]:
-    """Split "turn rate [rad/s]" into ("turn rate", "rad/s")."""
-    name, _, unit = label.removesuffix("]").partition(" [")
-    return name, unit
-
-
 def arrow(robot: Robot, heading: float, inputs: Array) -> Array:
     """Return where an input would take the robot in `ARROW` periods, (d,), m, world frame.
 
@@ -126,9 +121,9 @@ def arrow(robot: Robot, heading: float, inputs: Array) -> Array:
     if robot.heading is None:
         return vector
     turning = [
-        value * (0.5 * seconds if split(label)[1] == "rad/s" else 0.5)
+        value * (0.5 * seconds if split_label(label)[1] == "rad/s" else 0.5)
         for value, label, moves in zip(inputs, robot.action, robot.translates, strict=True)
-        if not moves and split(label)[1] in ("rad", "rad/s")
+        if not moves and split_label(label)[1] in ("rad", "rad/s")
     ]
     angle = heading + sum(turning)
     cos, sin = math.cos(angle), math.sin(angle)
@@ -225,7 +220,7 @@ def change(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
         return f"turned {'left' if now > before else 'right'}", "straight on" if abs(before) < small else "as proposed"
     if robot.heading is None or sum(robot.translates) > 1:
         by_velocity = _describe_velocity(_moves(robot, proposed), _moves(robot, executed))
-        name, unit = split(robot.action[most])
+        name, unit = split_label(robot.action[most])
         return by_velocity or (f"{name} {before:.2f} became {now:.2f} {unit}".rstrip(), "as proposed")
     if before * now < 0.0:
         return ("backed off" if now < 0.0 else "went forward"), "as proposed"

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from brakeline.errors import BadDescription, BadText, UnknownRobot
 from brakeline.messaging.description_checks import field_problem, inconsistencies
 from brakeline.messaging.description_model import DescriptionModel
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, Disc, Limit, Robot
 from brakeline.messaging.structured_text import parse_toml
 
@@ -139,9 +140,9 @@ def describe(robot: Robot) -> dict[str, Any]:
 
 
 def _describe_state(robot: Robot) -> dict[str, Any]:
-    input_names = [name for name, _ in _names_and_units(robot.action)]
+    input_names = [name for name, _ in map(split_label, robot.action)]
     state: dict[str, Any] = {}
-    for k, (name, unit) in enumerate(_names_and_units(robot.state)):
+    for k, (name, unit) in enumerate(map(split_label, robot.state)):
         role = "position" if k < robot.position_dim else "heading" if k == robot.heading else "other"
         state[name] = {
             "unit": unit,
@@ -156,7 +157,7 @@ def _describe_state(robot: Robot) -> dict[str, Any]:
 
 def _describe_inputs(robot: Robot) -> dict[str, Any]:
     inputs: dict[str, Any] = {}
-    for i, (name, unit) in enumerate(_names_and_units(robot.action)):
+    for i, (name, unit) in enumerate(map(split_label, robot.action)):
         rule: Any = robot.stop[i]
         if rule == FEEDBACK:
             rule = _nonzero(robot, robot.feedback[i])
@@ -172,13 +173,7 @@ def _describe_inputs(robot: Robot) -> dict[str, Any]:
     return inputs
 
 
-def _names_and_units(labels: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Split labels such as `vx [m/s]`."""
-    parts = [label.rpartition(" [") for label in labels]
-    return [(name, unit.removesuffix("]")) for name, _, unit in parts]
-
-
 def _nonzero(robot: Robot, weights: tuple[float, ...]) -> dict[str, float]:
     """Return the weights that are not zero, by the names of their state coordinates."""
-    names = [name for name, _ in _names_and_units(robot.state)]
+    names = [name for name, _ in map(split_label, robot.state)]
     return {name: weight for name, weight in zip(names, weights, strict=True) if weight}

@@ -17,6 +17,7 @@ from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Un
 from brakeline.errors import BadScan
 from brakeline.logs.stacking_table import StackingTable, plain_table
 from brakeline.messaging.bus import Bus
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array, robot_named
@@ -115,9 +116,9 @@ def plan_table(answer: Answer, inputs: tuple[str, ...]) -> StackingTable:
 
 def quantity(name: str, value: float) -> str:
     """Return an input as text: `speed 0.25 m/s` for the name `speed [m/s]`."""
-    word, _, unit = name.partition(" [")
+    word, unit = split_label(name)
     shown = value if abs(value) > NOTHING else 0.0
-    return f"{word} {shown:.4g} {unit.removesuffix(']')}".rstrip()
+    return f"{word} {shown:.4g} {unit}".rstrip()
 
 
 def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:

@@ -12,7 +12,8 @@ import numpy as np
 
 from brakeline.deploy.data.certification import HELD_OUT, MAX_INFLATION
 from brakeline.deploy.data.input_response import followed_inputs
-from brakeline.deploy.data.sources.quantity_names import column_names, split
+from brakeline.deploy.data.sources.quantity_names import column_names
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.model.dataset import Dataset
@@ -75,9 +76,11 @@ def coverage(data: Dataset) -> Coverage:
     names, inputs = column_names(robot)
     driven, states = (np.concatenate([getattr(t, part) for t in data.trajectories]) for part in ("inputs", "states"))
     bounds = list(zip(robot.action_low, robot.action_high, strict=True))
-    units = [split(label)[1] for label in robot.action]
+    units = [split_label(label)[1] for label in robot.action]
     seen = [_seen(name, units[i], *bounds[i], driven[:, i]) for i, name in enumerate(inputs)]
-    followers = [_seen(names[k], split(robot.state[k])[1], *bounds[i], states[:, k]) for i, k in followed_inputs(robot)]
+    followers = [
+        _seen(names[k], split_label(robot.state[k])[1], *bounds[i], states[:, k]) for i, k in followed_inputs(robot)
+    ]
     rested = resting_periods_at_end(robot)
     stops = sum(len(stopping_distances(robot, t, rested)) for t in data.trajectories)
     begun = _begun(data)
@@ -278,7 +281,7 @@ def _where(leaving: Sequence[ViolationGroup]) -> str:
 
 def _remedy(robot: Robot, regime: str) -> str:
     """Return what to record, or which bounds to lower, if plans left their sets in this regime."""
-    inputs = [split(label)[0] for label in robot.action]
+    inputs = [split_label(label)[0] for label in robot.action]
     moving, turning = (
         " and ".join(name for name, moves in zip(inputs, robot.translates, strict=True) if moves == wanted)
         for wanted in (True, False)
@@ -317,7 +320,7 @@ def draw_coverage(data: Dataset, covered: Coverage, path: Path) -> None:
             ax.set_ylabel("periods")
         for bound in (robot.action_low[i], robot.action_high[i]):
             ax.axvline(bound, color="k", linewidth=0.8, linestyle="--")
-        ax.set_xlabel(f"{inputs[i]} [{split(robot.action[i])[1]}]")
+        ax.set_xlabel(f"{inputs[i]} [{split_label(robot.action[i])[1]}]")
     title = f"{robot.name}: {data.periods} periods, {covered.stops} stops"
     figure.suptitle("\n".join([title, *(f"missing: {text}" for text in covered.missing[:4])]), fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)

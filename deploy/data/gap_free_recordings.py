@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.sources.quantity_names import column_names, split
+from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.data.sources.source_table import Array, Series, Table
 from brakeline.errors import NoSource
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Robot
 
 Span = tuple[float, float]  # begin and end in s
@@ -138,7 +139,7 @@ def _fastest(robot: Robot) -> dict[str, float]:
     """Return the fastest motion that the inputs' bounds allow, by unit; 0 if no input is in the unit."""
     fastest = {"m/s": 0.0, "rad/s": 0.0}
     for label, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True):
-        if (unit := split(label)[1]) in fastest:
+        if (unit := split_label(label)[1]) in fastest:
             fastest[unit] = float(np.hypot(fastest[unit], max(abs(low), abs(high))))
     return fastest
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.error_causes import REGIMES, regimes
 
@@ -40,4 +41,4 @@ def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str,
 
 def at_bound(robot: Robot) -> list[str]:
     """Return the names of the kinds of driving in which an input is at its bound, for each input (m,)."""
-    return [f"{label.rpartition(' [')[0]} at its bound" for label in robot.action]
+    return [f"{split_label(label)[0]} at its bound" for label in robot.action]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Array, Robot
 
 PATH, AFTER = "the path within a period", "the stopping distance"
@@ -50,7 +51,7 @@ def state_parts(robot: Robot, discs: int = 0) -> list[str]:
         robot: the robot.
         discs: number of further coordinates, which are displacements of the body's other discs.
     """
-    names = [label.rpartition(" [")[0] for label in robot.state]
+    names = [split_label(label)[0] for label in robot.state]
     if robot.heading is not None:
         names[: robot.position_dim] = position_parts(robot)
     return names + ["position of a disc of the body"] * discs

@@ -19,6 +19,7 @@ from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
 from brakeline.deploy.data.unit_table import AS_IT_IS, in_si, unknown_unit
 from brakeline.errors import NoSource
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Robot
 
 AXES = "xyz"
@@ -27,16 +28,10 @@ Place = tuple[Table, str]  # a table and the name of its field
 Places = dict[str, Place]
 
 
-def split(label: str) -> tuple[str, str]:
-    """Split a label `name [unit]` into name and unit."""
-    name, _, unit = label.rpartition(" [")
-    return name, unit.removesuffix("]")
-
-
 def column_names(robot: Robot) -> tuple[list[str], list[str]]:
     """Return the column names of states and inputs. An input with the name of a coordinate becomes `command NAME`."""
-    states = [split(label)[0] for label in robot.state]
-    inputs = [split(label)[0] for label in robot.action]
+    states = [split_label(label)[0] for label in robot.state]
+    inputs = [split_label(label)[0] for label in robot.action]
     return states, [f"{COMMAND} {name}" if name in states else name for name in inputs]
 
 
@@ -44,7 +39,7 @@ def column_units(robot: Robot) -> dict[str, str]:
     """Return the unit of each column, states before inputs."""
     states, inputs = column_names(robot)
     labels = zip((*states, *inputs), (*robot.state, *robot.action), strict=True)
-    return {name: split(label)[1] for name, label in labels}
+    return {name: split_label(label)[1] for name, label in labels}
 
 
 def quantities(robot: Robot) -> dict[str, str]:
@@ -59,7 +54,7 @@ def quantities(robot: Robot) -> dict[str, str]:
         return f"{kind}.{AXES[min(sum(q.startswith(f'{kind}.') for q in quantity_of.values()), 2)]}"
 
     for i, name in enumerate(states):
-        unit = split(robot.state[i])[1]
+        unit = split_label(robot.state[i])[1]
         if i < robot.position_dim:
             quantity_of[name] = f"position.{AXES[i]}"
         elif i == robot.heading:
@@ -69,7 +64,7 @@ def quantities(robot: Robot) -> dict[str, str]:
         elif unit == "rad/s":
             quantity_of[name] = "yaw rate"
     for i, name in enumerate(inputs):
-        unit = split(robot.action[i])[1]
+        unit = split_label(robot.action[i])[1]
         if unit == "m/s":
             quantity_of[name] = next_axis(f"{COMMAND}.{frame}")
         elif (kind := {"rad/s": "yaw rate", "rad": "steering", "m/s2": "acceleration"}.get(unit)) is not None:
