@@ -15,6 +15,7 @@ from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.reader import Paths
 from brakeline.logs.stacking_table import plain_table
 from brakeline.logs.tube_stats import stated
+from brakeline.messaging.stated_share import percent
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 # Rows of a curve's bins.
@@ -45,6 +46,7 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
     """
     several = len(figures.get("runs", {})) > 1
     parts = _several(figures) if several else [plain_table((), _summary(figures)), *_times(figures)]
+    parts += [_driving(robot, kinds) for robot, kinds in figures.get("driving", {}).items()]
     parts += [_training(robot, training) for robot, training in figures.get("training", {}).items()]
     if figures.get("processes") and figures.get("topics"):
         parts.append(_processes(figures["processes"]))
@@ -254,6 +256,17 @@ def _times(figures: Figures) -> list[Table]:
 
 def _milliseconds(row: Figures, columns: Sequence[str]) -> list[str]:
     return [f"{row[name]:.3f}" for name in columns]
+
+
+def _driving(robot: str, kinds: Figures) -> Table:
+    """Format what the model set states by kind of driving beside what was driven."""
+    rows = []
+    for kind, counts in kinds.items():
+        outside, bound = share(counts["outside"], counts["windows"], digits=2), counts["bound"]
+        rows.append((kind, str(counts["windows"]), outside, "–" if bound is None else f"≤ {percent(bound)}"))
+    table = plain_table((f"{robot} driving", "windows", "outside the stated sets", "stated, of plans"), rows)
+    table.caption = "a window is as long as a plan; windows overlap, and may be of several kinds"
+    return table
 
 
 def _training(robot: str, training: Figures) -> Table:

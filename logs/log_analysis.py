@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from brakeline.logs.driving_stats import DrivingStats
 from brakeline.logs.episode_sampler import SKETCHES, ActorBuffer, EpisodeSampler
 from brakeline.logs.episode_stats import ENDS, OWN_PROGRAM, Figures, closed_loop
 from brakeline.logs.intervention_map import InterventionMap
@@ -53,6 +54,7 @@ class RunAnalysis:
         self.options = options or AnalysisOptions()
         self.metrics = Metrics(robots=log.robots)
         self.training: defaultdict[str, LearningCurve] = defaultdict(LearningCurve)  # by robot kind
+        self.driving = DrivingStats(log.robots, log.metadata)
         self.intervention_maps: dict[str, InterventionMap] = {}
         self.samplers: dict[str, EpisodeSampler] = {}
         self.timeline = ProcessTimeline()
@@ -83,13 +85,13 @@ class RunAnalysis:
         """Read all messages in one loop."""
         handlers: dict[str, Callable[[LogChannel, Any], None]] = {
             STEP.name: lambda channel, step: self.training[channel.robot].step(step),
-            EXCHANGE.name: lambda channel, exchange: self.training[channel.robot].exchange(exchange),
+            EXCHANGE.name: self._exchange,
             LEARNER.name: lambda _, metrics: self._learner(metrics),
         }
         if self.options.pictures or self.options.episode is not None:
             handlers |= {
                 STEP.name: self._step,
-                EXCHANGE.name: self._exchange,
+                EXCHANGE.name: self._drawn_exchange,
                 EPISODE.name: lambda channel, episode: self._buffer(channel)[1].about.append(episode),
                 HEALTH.name: lambda _, health: self.timeline.health(health, self._received),
                 LOG.name: lambda _, line: self.timeline.line(line, self._received),
@@ -117,8 +119,12 @@ class RunAnalysis:
         self.timeline.step(self._received)
 
     def _exchange(self, channel: LogChannel, exchange: Any) -> None:
+        self.training[channel.robot].exchange(exchange)
+        self.driving.exchange(exchange)
+
+    def _drawn_exchange(self, channel: LogChannel, exchange: Any) -> None:
         robot = channel.robot
-        self.training[robot].exchange(exchange)
+        self._exchange(channel, exchange)
         if robot not in self.intervention_maps:
             self.intervention_maps[robot] = InterventionMap(self.log.robots.named(robot))
         self.intervention_maps[robot].exchange(exchange)
@@ -217,6 +223,11 @@ class LogAnalysis:
                 prefix + robot: part.training[robot].figures()
                 for prefix, part in zip(prefixes, self.parts, strict=True)
                 for robot in sorted(part.training)
+            },
+            "driving": {
+                prefix + robot: kinds
+                for prefix, part in zip(prefixes, self.parts, strict=True)
+                for robot, kinds in part.driving.figures().items()
             },
             "runs": rows,
             "metadata": _common([run["metadata"] for run in rows.values()]),

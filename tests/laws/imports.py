@@ -29,8 +29,8 @@ PARTS: dict[str, tuple[str, ...]] = {
         *("safety.service.filter_client", "safety.service.client", "safety.service.wire"),
     ),
     "learner": ("messaging", "errors"),
-    # The viewers draw the map that the filter was shown.
-    "logs": ("messaging", "errors", "safety.perception.displayed_map"),
+    # The viewers draw the map that the filter was shown. An analysis counts by kind of driving, as statements do.
+    "logs": ("messaging", "errors", "safety.perception.displayed_map", "safety.model.driving_kinds"),
     "safety": ("messaging", "errors", "compilation"),
     "sim": ("messaging", "errors", "compilation"),
     "messaging": ("errors", "extras"),
