@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.logs.driving_stats import CHUNK, DrivingStats
+from brakeline.logs.figure_tables import _driving
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
@@ -63,6 +64,9 @@ def test_each_window_counts_in_its_kinds_beside_what_is_stated(stats):
     assert kinds["slow"]["excess"] == 2.5 and kinds["jumping inputs"]["excess"] == math.inf
     assert {kind for kind, row in kinds.items() if row["bound"] is not None} == {"standing"}
     assert kinds["standing"]["bound"] == 0.01
+    columns = [list(column.cells) for column in _driving("ground", kinds).columns]
+    assert [cells[columns[0].index("standing")] for cells in columns] == ["standing", "7", "2 (28.57%)", "≤ 1 %"]
+    assert [cells[columns[0].index("fast")] for cells in columns] == ["fast", "5", "1 (20.00%)", "–"]
 
 
 def test_its_regimes_add_up_to_the_windows_of_all_plans(stats):
