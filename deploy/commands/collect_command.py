@@ -32,7 +32,7 @@ class CollectCommand:
     """Fly the vehicle behind this link for the first time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The
     vehicle takes off, flies random targets in a box, slowly at first, and lands. No filter checks this flight: clear
     the box."""
-    first: options.Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
+    first_flight: options.Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
     accept_bound: options.AcceptBound = None
     quiet: options.Quiet = False
     json: options.Json = False
@@ -67,10 +67,10 @@ class CollectCommand:
             raise ValueError(f"--out {self.out} is a folder: give the path of a file, such as data.safetensors")
         if self.url and (self.trajectories is not None or self.physics != options.PhysicsOptions()):
             raise ValueError("--url ignores --trajectories and what changes the simulator: leave these options out")
-        age = self.first.acceleration_age
+        age = self.first_flight.acceleration_age
         if age is not None and not 0.0 <= age <= OLDEST:
             raise ValueError(f"--acceleration-age is a number of seconds from 0 to {OLDEST:g}, not {age:g}")
-        if not self.url and (self.first != FirstFlightSettings() or self.accept_bound is not None):
+        if not self.url and (self.first_flight != FirstFlightSettings() or self.accept_bound is not None):
             raise ValueError("the options of a first flight, such as --minutes and --accept-bound, need --url")
 
     def _first_flight(self) -> int:
@@ -85,7 +85,7 @@ class CollectCommand:
             raise ValueError(f"a {robot.kind} robot does not fly: leave out --url")
         accepted_bound(robot, self.accept_bound)
         path = self.out or record_path(robot).with_name("flown.safetensors")
-        flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first, path)
+        flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first_flight, path)
         minutes, model, report = flight.seconds / 60.0, flight.model, flight.report
         figures: dict[str, Any] = {"path": str(path), "periods": flight.data.periods, "minutes": minutes}
         figures |= {"level": flight.level, "missing": flight.missing}

@@ -59,7 +59,7 @@ class FlyCommand:
     period (0.2 s) on."""
     pictures: options.Pictures = RunConfig.pictures
     out: options.RunFolder = None
-    meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    bus: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
     verbose: options.Verbose = False
     quiet: options.Quiet = False
     json: options.Json = False
@@ -80,7 +80,7 @@ class FlyCommand:
         config, folder = self.config(), self.out or dated_folder()
         config = prepare(config, folder, resume=False)
         with Display(errors if self.json else console, config.steps * len(config.flights)) as display:
-            figures = Launcher(config, folder, self.meeting.settings(config, folder)).run(display)
+            figures = Launcher(config, folder, self.bus.settings(config, folder)).run(display)
         actors = [f"actor-{i}" for i in range(len(config.flights))]
         figures["flight"] = flight_figures(figures, actors[0])
         if len(actors) > 1:

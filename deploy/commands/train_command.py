@@ -32,7 +32,7 @@ class TrainCommand(RunConfig):
     out: options.RunFolder = None
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder, with its own configuration. Only --steps and --from-logs can change."""
-    meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    bus: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
     watch: options.Watch = False
     verbose: options.Verbose = False
     quiet: options.Quiet = False
@@ -41,7 +41,7 @@ class TrainCommand(RunConfig):
     # Options that `--help` leaves to `--help-all`.
     expert: ClassVar[tuple[str, ...]] = (
         *("physics", "fleet", "robots_per_actor", "penalty", "deadline", "replicas", "from_logs", "practice", "adapt"),
-        *("change", "deterministic", "record", "rotation", "pictures", "mavlink", "meeting", "learner"),
+        *("change", "deterministic", "record", "rotation", "pictures", "mavlink", "bus", "learner"),
     )
 
     def __post_init__(self) -> None:
@@ -107,14 +107,14 @@ class TrainCommand(RunConfig):
     def run(self) -> int:
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()
-        return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
+        return train(self.config(), folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
 
 
 def train(
     config: RunConfig,
     folder: Path,
     resume: bool,
-    meeting: options.RunBusOptions,
+    bus: options.RunBusOptions,
     as_json: bool,
     verbose: bool = False,
     watch: bool = False,
@@ -140,7 +140,7 @@ def train(
     steps = config.steps * len(config.robots)
     with LivePage(folder, browser) if watch else nullcontext() as page:
         with Display(shown, steps, page) as display:
-            figures = Launcher(config, folder, meeting.settings(config, folder)).run(display)
+            figures = Launcher(config, folder, bus.settings(config, folder)).run(display)
         if as_json:
             print_json(figures)
         else:
