@@ -464,7 +464,7 @@ def test_error_bounds_that_were_measured_on_another_recording_are_refused(data_f
         (CollectCommand(trajectories=0), "--trajectories a number from 1 on"),
         (CollectCommand(seed=-1), "--seed is a number from 0 on"),
         (CollectCommand(out=Path("/")), "is a folder: give the path of a file"),
-        (CollectCommand(first=FirstFlightSettings(minutes=3.0)), "need --url"),
+        (CollectCommand(first_flight=FirstFlightSettings(minutes=3.0)), "need --url"),
         (CollectCommand("quadrotor", url="udpin:0.0.0.0:1", trajectories=3), "--url ignores --trajectories"),
     ],
 )
