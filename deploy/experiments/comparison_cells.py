@@ -40,7 +40,7 @@ RESULTS, RUNS = Path("results"), Path("runs/compare")
 LEARNING = "learning"
 SEEDS: dict[str, int] = {"batch": 10, "single": 3}  # how many, by backend
 EPISODES = 500  # of each evaluation
-TUNED_AT_1 = (NONE, SECAS, SAILR)  # the tuning of these filters trained with a penalty of 1, or there is no filter
+AT_PENALTY_1 = (NONE, SECAS, SAILR)  # no task's penalty was chosen with these filters, or there is no filter
 TIMED = 10  # episodes that time single decisions, where a batch makes the others
 
 Report = Callable[[str], object]
@@ -174,7 +174,7 @@ def cell_configs(
         others |= {"task": own, "model_config": ModelConfig(mode=AUTO)}
     seeds = range(SEEDS[backend]) if seeds is None else seeds
     penalties = {
-        name: 1.0 if compared(name).filter in TUNED_AT_1 else task.reward.correction_penalty for name in methods
+        name: 1.0 if compared(name).filter in AT_PENALTY_1 else task.reward.correction_penalty for name in methods
     }
     return [
         CellConfig(robot, method, seed, task.steps, EPISODES, arenas, penalty=penalties[method], **others)

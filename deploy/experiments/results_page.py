@@ -337,6 +337,9 @@ THREATS = """## Threats to validity
 - **Our own task.** The arenas, the reward and the observation are ours. So is the learner, except SAC, whose
   implementation is Stable-Baselines3's.
 - **Own implementations of rivals.** They differ from their authors' versions as `docs/rivals.md` says.
+- **Ours is not the article's version.** Ours has model sets of mode `direct` with the error bound `residual`. The
+  article's recursion with matrix zonotopes gives sets that are too wide for these tasks (`conservatism.md` beside the
+  tables).
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
   data and in models by hand: see *Methods*. The equations by hand describe these
   simulated robots well.
@@ -345,7 +348,13 @@ THREATS = """## Threats to validity
 - **Tuning.** Each rival tuned one setting over four values (TD3-Lagrange six), in `default`. Penalty, its growth and
   imitation were chosen on trainings of ours whose seeds are in the table. More tuning may help every method, also ours.
   Where the best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from
-  one seed.
+  one seed. Filters were tuned with A* and a greedy policy, not with a policy that learns behind them, which may need
+  another value. In the air, SECAS and SAILR learn with a penalty of 1, not 12, and no stored training of them has
+  another one.
+- **SAC.** If *SAC* and *SAC, our filter* have different learning rates (see *Setup*), their rows differ in more than
+  the filter.
+- **Robots at once.** There are 16, so that the first episodes, which begin together, do not hide how few steps a method
+  needs. On the ground, PSF reached more goals with 64 at once (`docs/results_ground.md`).
 - **Rooms.** The trainings that chose penalty, its growth, imitation and turning aside were evaluated in rooms of the
   tables (the first 200 or all 500 of an arena), and the rivals' values in other rooms. This favours ours. The campaigns
   (`docs/campaigns.md`) drive the stored policies in 10,000 rooms of each arena, which contain these 500.

@@ -101,6 +101,56 @@ def test_the_pages_have_the_figures_of_the_comparison(name: str, robot: str) -> 
         assert label == METHODS[method].label and row == [*figures, f"{steps:,.0f}", f"{periods:,}"]
 
 
+def with_interval(share: dict[str, float], digits: int) -> str:
+    """Return a share of the table as the pages of the robots write it, such as `99.8 % [99.5, 100.0]`."""
+    value, low, high = (f"{100 * share[key]:.{digits}f}" for key in ("value", "low", "high"))
+    return f"{value} % [{low}, {high}]"
+
+
+def rows_of_the_robots_page(robot: str) -> dict[str, list[str]]:
+    """Return the rows of the first table of a robot's page with results, by their first cell."""
+    lines = (ROOT / "docs" / f"results_{robot}.md").read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith(f"| {robot}, after "))
+    table = lines[head : next(k for k in range(head, len(lines)) if not lines[k].startswith("|"))]
+    rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in table]
+    return {label: row for label, *row in rows}
+
+
+def test_the_page_of_the_ground_robot_has_the_figures_of_the_comparison() -> None:
+    parts, rows = (
+        json.loads((ROOT / "results/ground/table.json").read_text())["parts"],
+        rows_of_the_robots_page("ground"),
+    )
+    for method, training in parts["training"].items():
+        default, dense = parts["default"][method], parts["dense"][method]
+        figures = [
+            text
+            for part in (default, dense)
+            for text in (with_interval(part["goal rate"], 1), with_interval(part["collision rate"], 2))
+        ]
+        figures += [with_interval(training["collision rate"], 2), f"{training['steps to 90 % goals']['value']:,.0f}"]
+        figures.append(", ".join(f"{100 * part['interventions']['value']:.1f} %" for part in (default, dense)))
+        figures += [f"{default['mean speed [m/s]']['value']:.2f}", f"{default['mean reward']['value']:.0f}"]
+        assert rows[METHODS[method].label][1:] == [*figures, f"{default['decision [ms]']:.2f}"]
+
+
+def test_the_page_of_the_quadrotor_has_the_figures_of_the_comparison() -> None:
+    """Shares of collisions have two digits, so that a rare collision does not read as none."""
+    parts = json.loads((ROOT / "results/quadrotor/table.json").read_text())["parts"]
+    rows, training = rows_of_the_robots_page("quadrotor"), parts["training"]
+    assert rows["quadrotor, after 120,000 training steps"] == [METHODS[method].label for method in training]
+    for column, method in enumerate(training):
+        for arena in ("default", "dense"):
+            share = parts[arena][method]
+            assert rows[f"goals, `{arena}`"][column] == with_interval(share["goal rate"], 1)
+            assert rows[f"collisions, `{arena}`"][column] == with_interval(share["collision rate"], 2)
+        collided = with_interval(training[method]["collision rate"], 2)
+        assert rows["episodes of training with a collision"][column] == collided
+        steps = training[method]["steps to 90 % goals"]
+        mean, each = f"{steps['value']:,.0f}", ", ".join(f"{seed:,.0f}" for seed in steps["seeds"])
+        assert rows["steps to 90 % of goals: mean; each seed"][column] == f"{mean}; {each}"
+
+
 @pytest.mark.parametrize("name", ["README.md", "docs/faq.md", "docs/index.md"])
 def test_the_pages_state_the_bounds_of_the_shipped_model_sets(name: str) -> None:
     """A bound is rounded up."""
