@@ -159,14 +159,15 @@ def test_a_rare_collision_does_not_read_as_none(results):
 
 @pytest.mark.parametrize("mirrored, words", [("turns", "learns from mirrored steps"), ("none", "actor_rate")])
 def test_the_page_says_which_learners_had_mirrored_steps(results, monkeypatch, mirrored, words):
-    """Stable-Baselines3's SAC has none, whatever its cell says of TD3's settings."""
+    """Stable-Baselines3's SAC has the same ones as TD3."""
     ground = robot_with_task("ground")
     task = replace(ground.task, symmetry=mirrored)
     monkeypatch.setattr(results_page, "robot_with_task", lambda name: replace(ground, task=task))
     lines = [line for line in page(results, ["ground"]).splitlines() if "| learner of" in line]
     rows = {line.split("|")[1].strip(): line for line in lines}
-    assert words in rows["learner of TD3"] and ("no mirrored steps" in rows["learner of SAC"]) == (mirrored == "turns")
-    assert ("mirrored" in rows["learner of ours"]) == (mirrored == "turns")
+    assert words in rows["learner of TD3"]
+    for learner in ("TD3", "SAC", "ours"):
+        assert ("learns from mirrored steps" in rows[f"learner of {learner}"]) == (mirrored == "turns")
 
 
 def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
