@@ -23,6 +23,7 @@ from benchmarks import (
     adaptation_in_flight,
     askers,
     autopilot_conformance,
+    barrier_peers,
     batch_decide,
     batch_device,
     batch_simulation,
@@ -124,6 +125,7 @@ BENCHMARKS = {
     "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
     "model-peers": Benchmark(model_peers, lambda _: model_peers.run(), named=True),
+    "barrier-peers": Benchmark(barrier_peers, lambda _: barrier_peers.run(), named=True),
     "training": Benchmark(
         training_speed, lambda given: training_speed.run(given.seeds, given.batch.split()), named=True
     ),

@@ -4,13 +4,11 @@
 
 For a differential drive (examples/own_log, 4 and 15 minutes) and the shipped ground robot, each row has the half-width
 of the last set of a plan that brakes from full speed and of one that stands, the share of new plans whose positions
-leave their sets with its exact 99 % interval, and the processor times of the fit and of one tube. Behind the filter
-and behind a control barrier function with a unicycle, the adversary and the planner of examples/own_log then drive.
+leave their sets with its exact 99 % interval, and the processor times of the fit and of one tube.
 
 Every form predicts measured positions from measured states over the same plans. The peers get the features that the
 one-step form chose and its geometry of poses. Their noise bound is the envelope of the out-of-fold errors of one
-period, scaled to the same quantile. ZRLS forgets nothing (λ = 1, the narrowest here). The barrier's settings are those
-of `TUNINGS` with the fewest collisions, then the most goals, then the nearest approach, in episodes of other seeds.
+period, scaled to the same quantile. ZRLS forgets nothing (λ = 1, the narrowest here).
 """
 
 from __future__ import annotations
@@ -19,8 +17,7 @@ import importlib
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
-from itertools import product
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
 from types import ModuleType
@@ -32,24 +29,19 @@ from benchmarks.timing import Words
 from brakeline.deploy.data import collect
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.importer import import_sources
-from brakeline.deploy.data.rival_pretraining import BarrierConfig
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.filter.filter import Filter
-from brakeline.safety.methods import Method
 from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_config import CBF, DIRECT, FREE, MATRIX_ZONOTOPE, ONE_STEP, PLAN, ModelConfig
+from brakeline.safety.model.model_config import DIRECT, FREE, MATRIX_ZONOTOPE, ONE_STEP, PLAN, ModelConfig
 from brakeline.safety.model.model_set import RECURSION, ModelSet
 from brakeline.safety.model.one_step import features_for
 from brakeline.safety.model.one_step_fitting import choose
 from brakeline.safety.model.one_step_regression import Regression
 from brakeline.safety.model.windows import displacement, non_overlapping, plan_regressor_map, windows
-from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
 from brakeline.sim.sim_conditions import Conditions
 
 Tubes = Callable[[Array], tuple[Array, Array]]  # windows with all inputs (T, r + m + N·m) -> centres, half-widths
@@ -60,9 +52,6 @@ FRESH_RUNS, FRESH_TRAJECTORIES = 60, 60  # runs of a minute; trajectories of 300
 SEED = 1
 CHUNK = 64  # windows at once: an exact matrix zonotope has thousands of rows
 TIMED_S = 0.2  # processor time of the tubes that are timed
-EPISODES = 200  # of the adversary; the planner drives half as many
-TUNING_EPISODES = 20
-TUNINGS = [BarrierConfig(*values) for values in product((0.02, 0.05), (1.0, 2.0, 4.0), (0.0,))]
 
 
 @dataclass(frozen=True)
@@ -94,11 +83,11 @@ def own_log() -> ModuleType:
     return importlib.import_module("table")
 
 
-def driven(minutes: float, seed: int, runs: int = 1) -> Dataset:
-    """Return a drive of the differential drive, as `brakeline import` reads it."""
+def driven(minutes: float, seed: int, runs: int = 1, name: str = "diff") -> Dataset:
+    """Return a drive of a robot of examples/own_log, as `brakeline import` reads it."""
     with tempfile.TemporaryDirectory() as folder:
-        log = own_log().record("diff", minutes, seed, Path(folder) / "drive.csv", runs)
-        return import_sources([log], robot_named(str(OWN_LOG / "diff.toml"))).data
+        log = own_log().record(name, minutes, seed, Path(folder) / "drive.csv", runs)
+        return import_sources([log], robot_named(str(OWN_LOG / f"{name}.toml"))).data
 
 
 def recordings() -> Iterator[Recording]:
@@ -169,8 +158,8 @@ def row(recording: Recording, tubes: Tubes, fitted_s: float, one: Callable[[], o
     }
 
 
-def ours(recording: Recording, config: ModelConfig) -> tuple[dict[str, float | str], ModelSet]:
-    """Return the row of one of our forms, and its model set."""
+def ours(recording: Recording, config: ModelConfig) -> dict[str, float | str]:
+    """Return the row of one of our forms."""
     started = process_time()
     model, _, _ = certify_supported(recording.data, config)
     fitted_s = process_time() - started
@@ -180,7 +169,7 @@ def ours(recording: Recording, config: ModelConfig) -> tuple[dict[str, float | s
         exact = tube.at(z)
         exact.centers(z), exact.half_widths(z)
 
-    return row(recording, tubes_of(model), fitted_s, one), model
+    return row(recording, tubes_of(model), fitted_s, one)
 
 
 def peer(recording: Recording, fit: Callable[[Array, Array, Array], Models]) -> dict[str, float | str]:
@@ -219,46 +208,12 @@ class Rows(dict[str, dict[str, float | str]]):
 
 
 def run() -> Words:
-    """Return a row for each recording and form, then one for each method that decides and length of the log."""
+    """Return a row for each recording and form."""
     figures = Rows()
     for recording in recordings():
         for name, config in OURS.items():
             minutes = recording.kind == FREE  # as `brakeline certify` treats imported logs
-            figures[f"{recording.name}: {name}"], model = ours(recording, config.of_minutes() if minutes else config)
-            if config.mode == ONE_STEP and recording.kind == FREE:
-                figures[f"{recording.name}: filter"] = decisions("diff", Filter(model), EPISODES, SEED)
+            figures[f"{recording.name}: {name}"] = ours(recording, config.of_minutes() if minutes else config)
         for name, fit in PEERS.items():
             figures[f"{recording.name}: {name}"] = peer(recording, fit)
-    tuning = tuned()
-    for name in ("diff", "skid"):  # the skid steer has the same inputs, but is late and slips
-        barrier = barrier_for(robot_named(str(OWN_LOG / f"{name}.toml")), tuning)
-        figures[f"{name}: CBF-QP, unicycle, {tuning}"] = decisions(name, barrier, EPISODES, SEED)
     return figures
-
-
-def decisions(name: str, method: Method, episodes: int, seed: int) -> dict[str, float | str]:
-    """Return how the adversary and the planner of a robot fare behind a method, in the arenas of examples/own_log."""
-    table = own_log()
-    vehicle = table.VEHICLES[name]
-    adversary = table.episodes(vehicle, method, episodes, "adversary", 10_000 + seed)
-    planner = table.episodes(vehicle, method, episodes // 2, "planner", 20_000 + seed)
-    return {
-        "collisions": float(adversary["collisions"] + planner["collisions"]),
-        "nearest cm": 1e2 * adversary["nearest"],
-        "goals": f"{planner['goals']} of {planner['episodes']}",
-        "decide p50 ms": adversary["time_ms_p50"],
-    }
-
-
-def barrier_for(robot: Robot, tuning: BarrierConfig) -> UnicycleBarrier:
-    """Return the control barrier function of a robot without a task."""
-    return UnicycleBarrier(Pretrained(robot, CBF, {}, asdict(tuning)))
-
-
-def tuned() -> BarrierConfig:
-    """Return the settings with the fewest collisions, most goals and nearest approach, in episodes of other seeds."""
-    robot, errors_of = robot_named(str(OWN_LOG / "diff.toml")), {}
-    for tuning in TUNINGS:
-        had = decisions("diff", barrier_for(robot, tuning), TUNING_EPISODES, SEED + 5000)
-        errors_of[tuning] = had["collisions"], -int(str(had["goals"]).split()[0]), float(had["nearest cm"])
-    return min(errors_of, key=errors_of.__getitem__)
