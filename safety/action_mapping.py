@@ -78,8 +78,12 @@ def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMa
     return IDENTITY
 
 
-def cast_action(action: Any, space: gymnasium.Space[Any]) -> Any:
-    """Return the action with the type and shape of the environment's action space."""
+def action_for(control: Array, mapping: ActionMapping, space: gymnasium.Space[Any]) -> Any:
+    """Return the action for an input (m,), or for k inputs (k, m), with the type and shape of the action space.
+
+    The mapping gets a copy of the input: it and the environment may overwrite what they get.
+    """
+    action = mapping.control_to_action(control.copy())
     if isinstance(space, gymnasium.spaces.Box):
         return np.asarray(action, dtype=space.dtype).reshape(space.shape)
     return action

@@ -22,7 +22,7 @@ from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import percent
-from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import correction_penalty
 from brakeline.safety.gym_checks import check_robot
@@ -150,7 +150,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         proposed = np.asarray(self._actions.action_to_control(action), dtype=float)
         answer, reason = self._decide(proposed)
         executed, self._plan = self.backup_plan.next_input, self.backup_plan.plan
-        safe_action = cast_action(self._actions.control_to_action(executed), self.env.action_space)
+        safe_action = action_for(executed, self._actions, self.env.action_space)
         observation, reward, terminated, truncated, info = self.env.step(safe_action)
         if (record := getattr(self.client, "record_outcome", None)) is not None:  # of a `RecordedClient`
             ended = terminated or truncated

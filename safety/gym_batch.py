@@ -93,7 +93,7 @@ class BatchSafetyWrapper(VectorWrapper):
         check_rows(proposed, self.num_envs, self.plans.robot)
         obstacles = ObstacleArrays(**self._infos["obstacles"])
         outcome = self.plans.decide(self._infos["state"], proposed, obstacles, self._observations)
-        self.env.unwrapped.begin_step(outcome.inputs)  # type: ignore[attr-defined]
+        self.env.unwrapped.begin_step(outcome.inputs.copy())  # type: ignore[attr-defined]
         self._deciding = proposed, before, outcome
         return outcome
 

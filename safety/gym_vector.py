@@ -14,7 +14,7 @@ from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.robot import Array
 from brakeline.messaging.sensor_messages import RangeMeasurement
-from brakeline.safety.action_mapping import ActionMapping, mapping_for_space
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.filter.request import Request
@@ -93,8 +93,7 @@ class VectorSafetyWrapper(VectorWrapper):
         answers, faults = self._decide(deciding, proposed)
         executed = np.array([plan.next_input for plan in self.backup_plans])
         executed[resets] = robot.zero_input()
-        space = self.env.action_space
-        safe_actions = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
+        safe_actions = action_for(executed, self._actions, self.env.action_space)
         observations, rewards, terminated, truncated, infos = self.env.step(safe_actions)
         penalty = np.zeros(self.num_envs)
         for i in deciding:

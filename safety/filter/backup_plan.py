@@ -110,7 +110,7 @@ class BackupPlan:
     @property
     def next_input(self) -> Array:
         """(m,) the input to execute in the coming period, after `accept` or `fallback`."""
-        return self.plan[0].copy() if self.robot.late else self.input_in_force
+        return (self.plan[0] if self.robot.late else self.input_in_force).copy()
 
     @property
     def past(self) -> PastWindow | None:
@@ -125,7 +125,7 @@ class BackupPlan:
     def measured(self, state: Array) -> None:
         """Store the measured state (n,) of a period before its request; ignore it if it is not finite or misshapen."""
         if state.shape == self.seen.shape and np.isfinite(state).all():
-            self.seen, self._compare = state, True
+            self.seen, self._compare = state.copy(), True  # the caller may overwrite its array
 
     def accept(
         self,

@@ -87,6 +87,19 @@ def test_without_a_decision_every_client_goes_on_with_its_backup_plan(client):
     assert not client.backup_plan.input_in_force.any()
 
 
+def test_a_caller_may_overwrite_the_arrays_that_it_gives_and_gets(client):
+    """A driver scales the returned input to its own unit in place; the next request must have it as executed."""
+    state, plan = np.zeros(5), np.array([[0.2, 0.1], [0.1, 0.0], [0.0, 0.0]])
+    client.backup_plan.measured(state)
+    state += 1.0
+    assert not client.backup_plan.seen.any()
+    for step in (lambda: client.backup_plan.accept(plan, "v", None, True), client.fallback):
+        returned = step()
+        executed = returned.copy()
+        returned *= 0.5
+        assert np.array_equal(client.backup_plan.input_in_force, executed)
+
+
 def test_the_clients_have_the_same_parameters():
     wanted = list(signature(FilterClient.decide).parameters.values())
     for kind in (SafetyClient, InProcess):

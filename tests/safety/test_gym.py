@@ -145,6 +145,45 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     assert (diagnostics["kind"], diagnostics["verified"], diagnostics["reason"]) == ("failsafe", True, NOT_FINITE)
 
 
+class Overwriting(Toy):
+    """An environment that takes inputs, and halves the array that it gets."""
+
+    action_space = gymnasium.spaces.Box(CAR.low(), CAR.high(), dtype=np.float64)
+
+    def step(self, action):
+        self.got = action.copy()
+        action *= 0.5
+        return super().step(normalised(CAR).control_to_action(self.got).astype(np.float32))
+
+
+def mirrored(inputs):
+    """Change the sign of the curvature in place."""
+    inputs[..., 1] *= -1.0
+    return inputs
+
+
+@pytest.mark.parametrize("actions", [None, ActionMapping(lambda action: action * [1.0, -1.0], mirrored)])
+@pytest.mark.parametrize("many", [False, True])
+def test_an_environment_or_a_mapping_that_overwrites_what_it_gets_changes_no_figure(ready, many, actions):
+    """The executed input is the input in force of the next request: it was the overwritten one."""
+    toy, free = Overwriting(CAR), (lambda *_: [[]]) if many else near
+    env = wrapped(toy, ready, many, penalty=1.0, state=seen, obstacles=free, actions=actions)
+    proposed = np.array([0.4, 0.6])
+    for _ in range(3):
+        _, reward, *_, info = env.step(proposed[None] if many else proposed)
+        executed = np.reshape(info["diagnostics"]["executed"], 2)
+        sign = 1.0 if actions is None else -1.0
+        plan = env.backup_plans[0] if many else env.backup_plan
+        assert np.array_equal(toy.got, executed * [1.0, sign]) and np.array_equal(executed, plan.input_in_force)
+        assert np.array_equal(executed, [0.4, 0.6 * sign]) and not np.any(reward)
+
+
+def test_collecting_from_an_environment_that_overwrites_its_actions_records_what_was_driven():
+    env = Overwriting(CAR)
+    data = collect(env, CAR, 30, held=8, state=seen, shown=False)
+    assert np.array_equal(data.trajectories[-1].inputs[-1], env.got)
+
+
 def test_every_episode_starts_standing(ready):
     env = wrapped(Toy(CAR), ready, **HOW)
     env.step(np.array([1.0, 0.1], np.float32))
