@@ -150,6 +150,8 @@ class Scan(ComparedByValue):
             raise BadScan("a scan's ranges are finite: `far` without a hit, 0 or NaN without information")
         if (np.nan_to_num(self.ranges, nan=0.0) < 0.0).any():
             raise BadScan("a scan's ranges are 0 or more")
+        for name in ("pose", "mount"):  # copied: the caller may overwrite its arrays
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if len(self.pose) != 3 or len(self.mount) != 2:
             raise BadScan("a scan's pose has 3 coordinates, its mount 2")
         bounds = (self.range_error, self.position_error, self.heading_error, self.speed, self.age)
