@@ -137,6 +137,7 @@ class Scan(ComparedByValue):
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)
+        object.__setattr__(self, "ranges", np.ma.filled(self.ranges, 0.0))  # a masked beam has no information
         for name in ("ranges", "angles"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         n = self.ranges.size

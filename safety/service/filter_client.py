@@ -111,7 +111,9 @@ def vector_in(name: str, value: ArrayLike) -> Array:
         if vector.dtype.kind not in "fiubO":  # texts and complex numbers can be converted, but not as they are meant
             raise TypeError(f"an array of {vector.dtype}")
         vector = np.asarray(vector, float)
-    except (TypeError, ValueError) as error:
+        if isinstance(value, np.ma.MaskedArray):  # a masked number is missing
+            vector = np.where(np.ma.getmaskarray(value), np.nan, vector)
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadRequest(name, f"{name} is a {type(value).__name__}: give a list of numbers") from error
     if vector.ndim != 1:
         raise BadRequest(name, f"{name} has shape {vector.shape}: give a list of numbers")

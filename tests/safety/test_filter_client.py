@@ -15,7 +15,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, check_for_filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, NOT_FINITE, check_for_filter
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
@@ -134,13 +134,25 @@ def test_a_value_of_another_type_is_refused_with_its_field(client, field, more, 
 @pytest.mark.parametrize("field", ["state", "action"])
 @pytest.mark.parametrize(
     "value",
-    [None, 0.2, "abc", ["0.1", "0.2"], {}, [[0.1, 0.2]], [0.1, [0.2]], np.array([0.1 + 1j, 0.2]), [object()] * 2],
-    ids=["none", "number", "text", "texts", "dict", "nested", "ragged", "complex", "objects"],
+    [
+        *(None, 0.2, "abc", ["0.1", "0.2"], {}, [[0.1, 0.2]], [0.1, [0.2]], np.array([0.1 + 1j, 0.2])),
+        *([object()] * 2, [10**400] * 2),
+    ],
+    ids=["none", "number", "text", "texts", "dict", "nested", "ragged", "complex", "objects", "no double"],
 )
 def test_a_vector_of_another_type_is_refused_with_its_field(client, field, value):
     with pytest.raises(BadRequest, match=f"{field} .*: give a list of numbers") as caught:
         client.decide(**{"state": np.zeros(5), "action": [0.25, 0.0], field: value}, known_free=True)
     assert caught.value.field == field
+
+
+def test_a_masked_number_is_missing(ready):
+    """NumPy drops a mask without a word, and what lies below it is any number."""
+    state, action = np.ma.array(np.zeros(5), mask=[0, 1, 0, 0, 0]), np.ma.array([0.25, 0.0], mask=[1, 0])
+    safety = InProcess(ready, accept_bound=1.0)
+    assert safety.decide(np.zeros(5), action, known_free=True).reason == NOT_FINITE
+    with pytest.raises(BadRequest, match="state holds NaN"):
+        safety.decide(state, [0.25, 0.0], known_free=True)
 
 
 @pytest.mark.parametrize("deadline", [float("nan"), float("inf"), -1.0, 0.0, 1e300, None, "0.1"])
