@@ -57,7 +57,7 @@ class Request(ComparedByValue):
         action (m,): proposal.
         input_in_force (m,): input of the period before.
         plan (N, m): rest of the backup plan; in real time, from the input in force on.
-        obstacles: at least those within `Filter.reach`.
+        obstacles: at least those within the robot's `sight` of the measured position.
         model: version of the model set that verified the plan. Empty if the robot stands; `UNVERIFIED` if no model set
             verified the plan.
         predicted: predicted set of this state, from the last decision.

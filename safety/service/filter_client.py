@@ -1,6 +1,6 @@
 """The interface of every client of the filter, in process or over the bus.
 
-answer = client.decide(state, action, obstacles)               # obstacles: at least those within reach
+answer = client.decide(state, action, obstacles)               # obstacles: at least those within sight
 answer = client.decide(state, action, scan=scan)               # what the scan does not show to be free is occupied
 answer = client.decide(state, action, [], known_free=True)     # a map says that all space within reach is free
 """
@@ -83,7 +83,7 @@ class FilterClient(Protocol):
             state: (n,) measured, in the order and the units of the robot's description (`Robot.state`).
             action: (m,) proposed, in the order and the units of the description (`Robot.action`). If it holds NaN or
                 infinity, the decision is a failsafe.
-            obstacles: at least those within reach (1 m is enough for `ground`).
+            obstacles: at least those within the robot's `sight` of the measured position (1 m for `ground`).
             scan: a sensor's measurement, instead of obstacles or in addition: a `Scan`, or a `RangeImage` in space.
                 Fill it in with `brakeline.filled` first.
             observation: the task's observation. Only the rivals read it.
