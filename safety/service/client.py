@@ -274,8 +274,8 @@ class BusClient:
 class SafetyClient(BusClient):
     """Requests decisions about one robot from the safety service, and keeps its backup plan.
 
-    Use a client in one thread at a time. With several robots, use one client for each, or a `FleetClient` for robots
-    that share a world.
+    Use a client in one thread at a time, and in the process that opened it: a process that is forked later gets no
+    answers. With several robots, use one client for each, or a `FleetClient` for robots that share a world.
 
     >>> with SafetyClient.open(ENDPOINT, "ground", deadline=5.0) as safety:  # of `brakeline safety ground --listen …`
     ...     safety.decide([0, 0, 0, 0, 0], [0.25, 0], [Obstacle("cylinder", (0.4, 0.0), (0.1,))]).kind

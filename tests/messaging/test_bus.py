@@ -2,6 +2,7 @@
 had come alone.
 """
 
+import os
 import signal
 import threading
 import time
@@ -203,6 +204,20 @@ def test_closing_ends_the_handlers_and_what_comes_after_is_an_error(join: Join) 
         publisher.put(pb.Health())
     with pytest.raises(BusError, match="cannot ask"):
         bus.ask(DECIDE, b"", timeout=0.1, robot="ground")
+
+
+def test_a_forked_process_cannot_ask_and_says_so_at_once(join: Join) -> None:
+    """Zenoh's threads are not in it: it waited for ever, whatever its deadline, and its robot drove on."""
+    bus = join("client", listen=True)
+    if not (child := os.fork()):
+        signal.alarm(5)  # ends a child that hangs
+        try:
+            bus.ask(DECIDE, b"?", timeout=0.5, robot="ground")
+        except BusError as error:
+            os._exit(7 if "open a bus, or a client, after the fork" in str(error) else 1)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 
 def test_keys_of_nobody_and_too_many_are_passed_over(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
