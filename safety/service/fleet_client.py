@@ -40,7 +40,7 @@ class FleetClient(BusClient):
     ['allowed', 'allowed']
     """
 
-    def __init__(self, bus: Bus, robot: Robot | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
+    def __init__(self, bus: Bus, robot: Robot | Path | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
         """Make a client for robots of one kind; names: of the robots.
 
         Raises:
@@ -60,7 +60,7 @@ class FleetClient(BusClient):
     def open(
         cls,
         connect: str | Sequence[str],
-        robot: Robot | str,
+        robot: Robot | Path | str,
         names: Sequence[str],
         deadline: float = DEADLINE,
         keys: Path | str | None = None,

@@ -11,6 +11,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
@@ -18,7 +19,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, NOT_FINITE, check_for_filter
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.service.client import SafetyClient
+from brakeline.safety.service.client import SafetyClient, request_message
 from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.fleet_client import FleetClient
 from brakeline.safety.service.in_process import InProcess
@@ -163,6 +164,20 @@ def test_a_deadline_that_no_query_can_have_is_refused(join, endpoint, deadline):
             make()
     with pytest.raises(ValueError, match="a deadline is"):
         SafetyClient.open(endpoint, "ground", deadline)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("episode", -1), ("step", 2**40), ("step", 1.5), ("actor", 3), ("time", "now"), ("fleet", [1, 2])],
+)
+def test_a_label_of_another_type_is_refused_with_its_field(field, value):
+    with pytest.raises(BadRequest, match="give texts as actor and fleet, whole numbers from 0 as episode") as caught:
+        request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), **{field: value})
+    assert caught.value.field == field
+
+
+def test_a_client_takes_the_path_of_a_description(join):  # noqa: F811
+    assert SafetyClient(join("client", listen=True), ROBOTS_FOLDER / "ground.toml").robot.layout() == GROUND.layout()
 
 
 @IN_PROCESS_OR_SERVED
