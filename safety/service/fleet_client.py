@@ -96,6 +96,11 @@ class FleetClient(BusClient):
         """
         nothing: list[None] = [None] * len(self.names)
         local_maps = nothing if obstacles is None else obstacles, nothing if scans is None else scans
+        for name, values in zip(
+            ("states", "actions", "obstacles", "scans"), (states, actions, *local_maps), strict=True
+        ):
+            if len(values) != len(self.names):
+                raise ValueError(f"{name} has {len(values)} entries: give one for each of {', '.join(self.names)}")
         robots = zip(self.names, self.backup_plans, states, actions, *local_maps, strict=True)
         requests = [
             request_message(

@@ -297,12 +297,17 @@ def test_a_fleet_needs_known_free_space(fleet):
     assert {answer.kind for answer in fleet.decide(*questions, scans=walls)} == {"failsafe"}
 
 
+@pytest.mark.parametrize("name", ["states", "actions", "obstacles", "scans"])
+def test_a_fleet_needs_an_entry_for_each_robot_and_the_error_names_what_lacks_one(fleet, name):
+    given = {"states": [np.zeros(5)] * 2, "actions": [np.zeros(2)] * 2, "obstacles": [[], []], "scans": [None, None]}
+    with pytest.raises(ValueError, match=f"{name} has 3 entries: give one for each of {', '.join(NAMES)}"):
+        fleet.decide(**(given | {name: given[name] + given[name][:1]}), known_free=True)
+
+
 def test_a_malformed_fleet_is_refused(fleet):
     for names in ((), ("alone",), ("same", "same")):
         with pytest.raises(ValueError, match="two robots or more"):
             FleetClient(fleet.bus, "ground", names)
-    with pytest.raises(ValueError, match="zip"):
-        fleet.decide([np.zeros(5)], [[0.1, 0.0]] * 2, [[], []])
 
 
 def test_a_name_or_a_model_set_is_no_filter_and_the_error_says_what_to_give() -> None:
