@@ -93,7 +93,8 @@ class VectorSafetyWrapper(VectorWrapper):
         answers, faults = self._decide(deciding, proposed)
         executed = np.array([plan.next_input for plan in self.backup_plans])
         executed[resets] = robot.zero_input()
-        safe_actions = action_for(executed, self._actions, self.env.action_space)
+        space = self.env.action_space
+        safe_actions = np.asarray(action_for(executed, self._actions, space), dtype=space.dtype).reshape(space.shape)
         observations, rewards, terminated, truncated, infos = self.env.step(safe_actions)
         penalty = np.zeros(self.num_envs)
         for i in deciding:
