@@ -41,6 +41,10 @@ class Prediction(ComparedByValue):
         """Return whether the measured state (n,) lies in the set."""
         return all(off <= most + SAME_SET for off, most in self._errors(robot, state))
 
+    def copy(self) -> Prediction:
+        """Return the same set in arrays of its own."""
+        return Prediction(self.center.copy(), self.half_width.copy(), self.heading)
+
     def share_used(self, robot: Robot, state: Array) -> float:
         """Return the share of the set that the measured state (n,) uses.
 
@@ -158,7 +162,7 @@ class BackupPlan:
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
-        self.predicted = predicted if predicted is not None and len(predicted.center) else None
+        self.predicted = predicted.copy() if predicted is not None and len(predicted.center) else None
         return self._advance()
 
     @property

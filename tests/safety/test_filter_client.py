@@ -91,9 +91,13 @@ def test_without_a_decision_every_client_goes_on_with_its_backup_plan(client):
 def test_a_caller_may_overwrite_the_arrays_that_it_gives_and_gets(client):
     """A driver scales the returned input to its own unit in place; the next request must have it as executed."""
     state, plan = np.zeros(5), np.array([[0.2, 0.1], [0.1, 0.0], [0.0, 0.0]])
+    predicted = Prediction(np.zeros(5), np.full(5, 0.1), 0.0)
     client.backup_plan.measured(state)
     state += 1.0
     assert not client.backup_plan.seen.any()
+    client.backup_plan.accept(plan, "v", predicted, True)
+    predicted.center[:2] += 100.0  # to a map's origin
+    assert client.backup_plan.still_verified and not client.backup_plan.predicted.center.any()
     for step in (lambda: client.backup_plan.accept(plan, "v", None, True), client.fallback):
         returned = step()
         executed = returned.copy()
