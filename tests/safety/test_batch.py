@@ -142,6 +142,7 @@ def test_a_batch_decides_as_the_single_path(filters, form):
     kinds = {KINDS[kind] for row, kind in enumerate(answers.kind) if row not in answers.singly}
     assert {ALLOWED, ADJUSTED} <= kinds <= {ALLOWED, ADJUSTED, FAILSAFE}
     assert len(answers.singly) < 0.5 * len(requests)
+    assert all(answers.row(row - 100).reason == answers.row(row).reason for row in range(100)), "from the end"
 
 
 @pytest.mark.parametrize("form", ["ground direct", "two discs", "one-step"])
