@@ -48,9 +48,11 @@ class Prediction(ComparedByValue):
     def share_used(self, robot: Robot, state: Array) -> float:
         """Return the share of the set that the measured state (n,) uses.
 
-        It is the largest ratio of an error to its half-width. Above 1, the state is outside; NaN gives infinity.
+        It is the largest ratio of an error, less `SAME_SET`, to its half-width. Above 1, the state is outside; NaN
+        gives infinity.
         """
-        shares = [off / most if most > 0.0 else math.inf for off, most in self._errors(robot, state) if off != 0.0]
+        beyond = [(off - SAME_SET, most) for off, most in self._errors(robot, state) if not off <= SAME_SET]
+        shares = [off / most if most > 0.0 else math.inf for off, most in beyond]
         return math.inf if any(map(math.isnan, shares)) else max(shares, default=0.0)
 
     def _errors(self, robot: Robot, state: Array) -> Iterator[tuple[float, float]]:
