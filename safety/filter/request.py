@@ -340,8 +340,10 @@ def check_motion(robot: Robot, request: Request, further: Named) -> None:
     }
     _sized(robot, "action", request.action, inputs)
     _finite(robot, named | further)
-    if max(map(abs, request.state.tolist())) > FARTHEST:  # in any unit
-        raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
+    if max(sizes := [abs(value) for value in request.state.tolist()]) > FARTHEST:  # in any unit
+        at = sizes.index(max(sizes))
+        why = f"beyond ±{FARTHEST:g}, which is not plausible: use SI units, and an origin near the robot"
+        raise BadRequest("state", f"{robot.state[at]} is {request.state[at]:g}, {why}")
     _within_bounds(robot, "input_in_force", request.input_in_force)
 
 
