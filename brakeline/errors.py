@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from brakeline.messaging import brakeline_pb2 as pb
@@ -16,6 +16,18 @@ if TYPE_CHECKING:
 
 class BrakelineError(Exception):
     """The base of every exception that Brakeline raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Say how to copy the exception, also to another process: `Pool` waits for ever for one that it cannot copy.
+
+        Python calls the class with `args`, which holds the message alone.
+        """
+        return _copied, (type(self), self.args), vars(self)
+
+
+def _copied(kind: type[BrakelineError], args: tuple[Any, ...]) -> BrakelineError:
+    """Return an exception without its attributes."""
+    return kind.__new__(kind, *args)
 
 
 class MissingExtra(BrakelineError, ImportError):
