@@ -342,8 +342,8 @@ def check_motion(robot: Robot, request: Request, further: Named) -> None:
     _finite(robot, named | further)
     if max(sizes := [abs(value) for value in request.state.tolist()]) > FARTHEST:  # in any unit
         at = sizes.index(max(sizes))
-        why = f"beyond ±{FARTHEST:g}, which is not plausible: use SI units, and an origin near the robot"
-        raise BadRequest("state", f"{robot.state[at]} is {request.state[at]:g}, {why}")
+        why = f"{robot.state[at]} is {request.state[at]:g}; use SI units, and an origin near the robot"
+        raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible: {why}")
     _within_bounds(robot, "input_in_force", request.input_in_force)
 
 

@@ -134,5 +134,7 @@ def test_known_free_must_be_a_truth_value(ready):
 
 def test_a_position_on_the_globe_is_refused_with_what_to_do(ready):
     """Coordinates of a map projection, such as UTM, leave no digits for millimetres."""
-    with pytest.raises(BadRequest, match=r"y \[m\] is 5\.33e\+06, beyond ±10000, .* an origin near the robot"):
+    with pytest.raises(
+        BadRequest, match=r"a state beyond ±10000 .* y \[m\] is 5\.33e\+06; .* an origin near the robot"
+    ):
         ready.decide(request(state=(691_000.0, 5_330_000.0, 0.0, 0.0, 0.0)))
