@@ -23,7 +23,7 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
-from brakeline.safety.environment_views import OBSTACLES, STATE, View
+from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import correction_penalty
 from brakeline.safety.gym_checks import check_robot
 from brakeline.safety.perception.image_memory import filled, memory_of
@@ -132,12 +132,13 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return cls(env, ready(load(path_of_model(model))), penalty, **how)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._now = self.env.reset(seed=seed, options=options)
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._now = copied((observation, info))
         self.client.reset()
         self._plan = self.backup_plan.plan
         self._memory.reset()
         self._remember()
-        return self._now
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._now is None:
@@ -158,7 +159,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         penalty = correction_penalty(self.client.robot, proposed, before, executed, self.penalty)
         figures = diagnostics(answer, reason) | {"proposed": proposed, "executed": executed}
         info = info | {"safety": answer, "proposed": action, "penalty": penalty, "diagnostics": figures}
-        self._now = observation, info
+        self._now = copied((observation, info))
         self._remember()
         return observation, float(reward) - penalty, terminated, truncated, info
 

@@ -15,7 +15,7 @@ from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.robot import Array
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
-from brakeline.safety.environment_views import OBSTACLES, STATE, View
+from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import diagnostics, is_measurement_fault
@@ -75,10 +75,10 @@ class VectorSafetyWrapper(VectorWrapper):
         observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
         if self._now is not None:
             infos = with_earlier_rows(infos, self._now[1], ~which)
-        self._now = observations, infos
+        self._now = copied((observations, infos))
         self._begin(which)
         self._remember(infos, which)
-        return self._now
+        return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         if self._now is None:
@@ -110,7 +110,7 @@ class VectorSafetyWrapper(VectorWrapper):
             "diagnostics": {name: np.array([row[name] for row in figures]) for name in figures[0]}
             | {"proposed": proposed, "executed": executed},
         }
-        self._now = observations, infos
+        self._now = copied((observations, infos))
         return observations, np.asarray(rewards) - penalty, terminated, truncated, infos
 
     def _decide(self, deciding: list[int], proposed: Array) -> tuple[dict[int, Answer], dict[int, str]]:

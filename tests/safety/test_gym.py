@@ -178,6 +178,34 @@ def test_an_environment_or_a_mapping_that_overwrites_what_it_gets_changes_no_fig
         assert np.array_equal(executed, [0.4, 0.6 * sign]) and not np.any(reward)
 
 
+class Informed(Toy):
+    """It also reports the state in an info, as a plain array and in a dict."""
+
+    def reset(self, **how):
+        observation, _ = super().reset(**how)
+        return observation, {"state": observation.copy(), "more": {"state": observation.copy()}}
+
+    def step(self, action):
+        observation, *ended, _ = super().step(action)
+        return observation, *ended, {"state": observation.copy(), "more": {"state": observation.copy()}}
+
+
+@pytest.mark.parametrize("place", [lambda o, i: o, lambda o, i: i["state"], lambda o, i: i["more"]["state"]])
+@pytest.mark.parametrize("many", [False, True])
+def test_a_policy_that_overwrites_what_it_observes_changes_no_decision(ready, many, place):
+    """A policy normalises its observation in place. The next request measured that."""
+    free = (lambda *_: [[]]) if many else near
+    how = HOW | {"state": lambda env, observation, info: place(observation, info), "obstacles": free}
+    env, sound = (wrapped(Informed(CAR), ready, many, **how) for _ in range(2))
+    action, returned = np.full((1, 2) if many else 2, 0.3, np.float32), env.reset(seed=0)
+    sound.reset(seed=0)
+    for _ in range(4):
+        place(*returned)[...] = 3.0
+        observation, *_, info = env.step(action)
+        returned, (*_, wanted) = (observation, info), sound.step(action)
+        assert np.array_equal(info["safety"], wanted["safety"]) if many else info["safety"] == wanted["safety"]
+
+
 def test_collecting_from_an_environment_that_overwrites_its_actions_records_what_was_driven():
     env = Overwriting(CAR)
     data = collect(env, CAR, 30, held=8, state=seen, shown=False)

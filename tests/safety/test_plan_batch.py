@@ -205,6 +205,9 @@ def test_an_environment_that_overwrites_its_inputs_changes_no_figure() -> None:
     env.reset(seed=0)
     *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
     assert np.array_equal(infos["executed"], env.plans.input_in_force) and not infos["penalty"].any()
+    infos["state"][:] = 3.0
+    *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
+    assert infos["outcome"].answers.contained.all(), "a policy that overwrites a state changes no request"
     env.close()
 
 
