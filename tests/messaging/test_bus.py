@@ -176,6 +176,13 @@ def test_an_endpoint_without_protocol_or_address_is_refused_at_once(wrong: str) 
         BusSettings(connect=(wrong,)).check()
 
 
+def test_settings_of_python_are_refused_with_what_to_give_in_python() -> None:
+    with pytest.raises(ValueError, match="in Python, give keys=FOLDER"):
+        BusSettings(connect=("tls/127.0.0.1:7447",)).check()
+    with pytest.raises(ValueError, match=r"connect is a text: give a tuple .* \('tcp/127.0.0.1:7447',\)"):
+        BusSettings(connect="tcp/127.0.0.1:7447").check()  # type: ignore[arg-type]
+
+
 def test_a_client_waits_for_its_router(join: Join) -> None:
     opened: list[Bus] = []
     waiting = threading.Thread(target=lambda: opened.append(join("actor-0", patience=10.0)))
