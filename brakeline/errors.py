@@ -86,9 +86,10 @@ class Refused(BusError):
 class InvalidField(BrakelineError, ValueError):
     """A value is invalid. `field` names it."""
 
-    def __init__(self, field: str, message: str) -> None:
-        super().__init__(message)
-        self.field = field
+    def __init__(self, field: str | InvalidField, message: str = "") -> None:
+        again = field if isinstance(field, InvalidField) else None  # Gymnasium raises a worker's `type(error)(error)`
+        super().__init__(message if again is None else str(again))
+        self.field: str = str(field) if again is None else again.field
 
 
 class BadText(BrakelineError, ValueError):

@@ -44,6 +44,7 @@ def test_the_table_of_names_is_complete():
 EXCEPTIONS = [one for one in vars(errors).values() if inspect.isclass(one) and issubclass(one, errors.BrakelineError)]
 ARGUMENTS = {  # by annotation
     "str": "state",
+    "str | InvalidField": "state",
     "Path": Path("part"),
     "pb.Error": pb.Error(type="BadRequest", field="state", message="why"),
     "Sequence[tuple[str, str]]": [("field", "mistake")],
@@ -59,6 +60,14 @@ def test_an_exception_reaches_another_process_as_it_is(kind):
     error.add_note("in episode 3")
     for other in (copy.copy(error), copy.deepcopy(error)):
         assert type(other) is kind and str(other) == str(error) and vars(other) == vars(error)
+
+
+@pytest.mark.parametrize("kind", [errors.BadRequest, errors.BadShape, errors.StaleModel])
+def test_an_exception_that_gymnasium_raises_anew_says_the_same(kind):
+    """`AsyncVectorEnv` raised `TypeError: missing 1 required positional argument` in its place."""
+    error = kind("state", "state has another shape")
+    again = kind(error)
+    assert (str(again), again.field) == (str(error), error.field)
 
 
 CLIENT = "from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground')"
