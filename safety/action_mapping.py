@@ -84,6 +84,8 @@ def action_for(control: Array, mapping: ActionMapping, space: gymnasium.Space[An
     The mapping gets a copy of the input: it and the environment may overwrite what they get.
     """
     action = mapping.control_to_action(control.copy())
-    if isinstance(space, gymnasium.spaces.Box):
-        return np.asarray(action, dtype=space.dtype).reshape(space.shape)
-    return action
+    if not isinstance(space, gymnasium.spaces.Box):
+        return action
+    if space.dtype is not None and space.dtype.kind in "iu":  # a cast cuts off: 28.999999999999996 became 28
+        action = np.rint(action)
+    return np.asarray(action, dtype=space.dtype).reshape(space.shape)

@@ -11,7 +11,7 @@ from brakeline.deploy.data.environment_episodes import collect
 from brakeline.errors import BadData, BadModel, BadRequest, Mismatch, NoReply
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
-from brakeline.safety.action_mapping import ActionMapping, mapping_for_space, normalised
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space, normalised
 from brakeline.safety.environment_views import STATE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
@@ -204,6 +204,14 @@ def test_a_policy_that_overwrites_what_it_observes_changes_no_decision(ready, ma
         observation, *_, info = env.step(action)
         returned, (*_, wanted) = (observation, info), sound.step(action)
         assert np.array_equal(info["safety"], wanted["safety"]) if many else info["safety"] == wanted["safety"]
+
+
+@pytest.mark.parametrize("centimetres", [0, 28, 29, 57, 58, 60])
+def test_an_action_in_whole_units_is_the_input_that_was_decided(centimetres):
+    space = gymnasium.spaces.Box(0, 60, (2,), np.int32)
+    in_cm = ActionMapping(lambda action: action / 100.0, lambda control: 100.0 * control)
+    action = action_for(in_cm.action_to_control(np.array([centimetres, 0])), in_cm, space)
+    assert action.dtype == np.int32 and action.tolist() == [centimetres, 0]
 
 
 def test_collecting_from_an_environment_that_overwrites_its_actions_records_what_was_driven():
