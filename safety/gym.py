@@ -86,7 +86,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description; with a client, to the
                 limit of the client or of its service.
-            turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on.
+            turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on. A client
+                whose backup plan asks for it does so anyway.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given. Or the environment
@@ -106,7 +107,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         check_robot(env, self.client.robot)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
         check_numbers(self, "penalty", least=0.0)
-        self.backup_plan.turn_aside = turn_aside
+        self.backup_plan.turn_aside |= turn_aside
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.action_space, self.client.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None

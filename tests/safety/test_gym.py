@@ -214,6 +214,14 @@ def test_an_action_in_whole_units_is_the_input_that_was_decided(centimetres):
     assert action.dtype == np.int32 and action.tolist() == [centimetres, 0]
 
 
+@pytest.mark.parametrize("asked", [False, True])
+@pytest.mark.parametrize("wanted", [False, True])
+def test_a_wrapper_leaves_a_client_that_turns_aside_as_it_is(ready, asked, wanted):
+    client = InProcess(ready, accept_bound=1.0)
+    client.backup_plan.turn_aside = asked
+    assert wrapped(Toy(CAR), client, turn_aside=wanted, **HOW).backup_plan.turn_aside == (asked or wanted)
+
+
 def test_collecting_from_an_environment_that_overwrites_its_actions_records_what_was_driven():
     env = Overwriting(CAR)
     data = collect(env, CAR, 30, held=8, state=seen, shown=False)
