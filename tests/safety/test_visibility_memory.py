@@ -153,6 +153,13 @@ def test_overwriting_the_callers_array_does_not_change_the_memory(memory):
     assert (last.ranges == 0.5).all()
     assert beams.ndim == 2 or last.angles[0] == -math.pi
     assert (last.pose if beams.ndim == 1 else last.at) == (0.0, 0.0, 0.0)
+    last.ranges[:] *= 1000.0  # for a display in mm
+    again = memory.fill(None, 0.2)
+    again.ranges[:] *= 1000.0
+    assert (memory.fill(None, 0.2).ranges == 0.5).all()
+    memory.reset()
+    memory.fill(None, 0.2).ranges[:] = 3.0
+    assert not memory.nothing.valid_beams.any()
 
 
 @pytest.mark.parametrize("low", [-90.0, -89.0, -45.0])
