@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from brakeline.messaging import brakeline_pb2 as pb
@@ -16,6 +16,18 @@ if TYPE_CHECKING:
 
 class BrakelineError(Exception):
     """The base of every exception that Brakeline raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Say how to copy the exception, also to another process: `Pool` waits for ever for one that it cannot copy.
+
+        Python calls the class with `args`, which holds the message alone.
+        """
+        return _copied, (type(self), self.args), vars(self)
+
+
+def _copied(kind: type[BrakelineError], args: tuple[Any, ...]) -> BrakelineError:
+    """Return an exception without its attributes."""
+    return kind.__new__(kind, *args)
 
 
 class MissingExtra(BrakelineError, ImportError):
@@ -74,9 +86,10 @@ class Refused(BusError):
 class InvalidField(BrakelineError, ValueError):
     """A value is invalid. `field` names it."""
 
-    def __init__(self, field: str, message: str) -> None:
-        super().__init__(message)
-        self.field = field
+    def __init__(self, field: str | InvalidField, message: str = "") -> None:
+        again = field if isinstance(field, InvalidField) else None  # Gymnasium raises a worker's `type(error)(error)`
+        super().__init__(message if again is None else str(again))
+        self.field: str = str(field) if again is None else again.field
 
 
 class BadText(BrakelineError, ValueError):

@@ -10,8 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 ROUNDING = 1e-9  # when two measurements are compared [m, m/s]
+
+
+def keep_vectors(owner: Any, *names: str) -> None:
+    """Make tuples of a frozen dataclass's arrays and lists: a tracker overwrites its arrays."""
+    for name in names:
+        if not isinstance(value := getattr(owner, name), tuple) and hasattr(value, "__len__"):
+            object.__setattr__(owner, name, tuple(value))
 
 
 @dataclass(frozen=True)
@@ -21,6 +29,9 @@ class Sighting:
     position: tuple[float, ...]  # [m]
     velocity: tuple[float, ...]  # [m/s]
     since: float  # time between the previous measurement and this one [s]
+
+    def __post_init__(self) -> None:
+        keep_vectors(self, "position", "velocity")
 
 
 @dataclass(frozen=True)
@@ -47,6 +58,9 @@ class Motion:
     speed: float | None = None
     age: float = 0.0
     before: Sighting | None = None
+
+    def __post_init__(self) -> None:
+        keep_vectors(self, "velocity")
 
     def problem(self, dim: int) -> str:
         """Return the reason why this is no valid motion of an obstacle with `dim` coordinates; empty if it is valid."""

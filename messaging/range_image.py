@@ -78,8 +78,8 @@ class RangeImage(ComparedByValue):
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)
-        # Compiled functions expect contiguous double precision.
-        object.__setattr__(self, "ranges", np.ascontiguousarray(self.ranges, dtype=float))
+        # A masked beam has no information. Compiled functions expect contiguous double precision.
+        object.__setattr__(self, "ranges", np.ascontiguousarray(np.ma.filled(self.ranges, 0.0), dtype=float))
         if self.ranges.ndim != 2 or not all(self.ranges.shape) or self.ranges.size > MAX_BEAMS:
             raise BadScan(f"a range image has rings and columns, of {MAX_BEAMS} beams at most")
         if not np.isfinite(self.ranges).all() or (self.ranges < 0.0).any():

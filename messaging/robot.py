@@ -360,7 +360,7 @@ def shipped_robots() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in ROBOTS_FOLDER.glob("*.toml") if "." not in path.stem))
 
 
-def robot_named(name: str) -> Robot:
+def robot_named(name: Path | str) -> Robot:
     """Read a robot by its name or path.
 
     >>> robot_named("quadrotor").position_dim
@@ -375,6 +375,7 @@ def robot_named(name: str) -> Robot:
     """
     from brakeline.messaging.robot_description import read_robot
 
+    name = str(name)
     base = name.removesuffix(REAL_TIME_SUFFIX)
     if base.endswith(".toml"):
         robot = refuse_shipped_name(read_robot(Path(base)))

@@ -17,7 +17,7 @@ from brakeline.messaging.description_checks import field_problem, inconsistencie
 from brakeline.messaging.description_model import DescriptionModel
 from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, Disc, Limit, Robot
-from brakeline.messaging.structured_text import parse_toml
+from brakeline.messaging.structured_text import TOML_ENCODING, parse_toml
 
 
 def read_robot(path: Path) -> Robot:
@@ -28,7 +28,7 @@ def read_robot(path: Path) -> Robot:
         UnknownRobot: the file cannot be read.
     """
     try:
-        text = path.read_text()
+        text = path.read_text(TOML_ENCODING)
     except (OSError, UnicodeDecodeError) as error:
         raise UnknownRobot(f"{path}: {error}; a robot is a name or the path of a description (.toml)") from error
     return _parse(text, str(path))

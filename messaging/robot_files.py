@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from brakeline.messaging.structured_text import parse_toml
+from brakeline.messaging.structured_text import TOML_ENCODING, parse_toml
 
 ROBOTS_FOLDER = Path(__file__).parents[1] / "robots"
 REAL_TIME_SUFFIX = "-late"  # suffix of a robot's name in real time
@@ -32,6 +32,6 @@ def task_values(path: Path) -> dict[str, Any]:
     Raises:
         OSError, BadText: there is no such file, or it is not TOML.
     """
-    values = parse_toml(path.read_text())
+    values = parse_toml(path.read_text(TOML_ENCODING))
     base = values.pop("like", None)
     return ({} if base is None else task_values(path.with_name(f"{base}{TASK_SUFFIX}"))) | values

@@ -137,6 +137,7 @@ class Scan(ComparedByValue):
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)
+        object.__setattr__(self, "ranges", np.ma.filled(self.ranges, 0.0))  # a masked beam has no information
         for name in ("ranges", "angles"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         n = self.ranges.size
@@ -150,6 +151,8 @@ class Scan(ComparedByValue):
             raise BadScan("a scan's ranges are finite: `far` without a hit, 0 or NaN without information")
         if (np.nan_to_num(self.ranges, nan=0.0) < 0.0).any():
             raise BadScan("a scan's ranges are 0 or more")
+        for name in ("pose", "mount"):  # copied: the caller may overwrite its arrays
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if len(self.pose) != 3 or len(self.mount) != 2:
             raise BadScan("a scan's pose has 3 coordinates, its mount 2")
         bounds = (self.range_error, self.position_error, self.heading_error, self.speed, self.age)

@@ -8,6 +8,8 @@ from typing import Any
 
 from brakeline.errors import BadText
 
+TOML_ENCODING = "utf-8-sig"  # UTF-8 in every locale, also with the mark that editors of Windows write at the start
+
 
 def parse_json(text: str | bytes) -> Any:
     """Return the value of a JSON text. Raises BadText: the text is not JSON, or nested too deeply."""

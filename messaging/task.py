@@ -214,7 +214,7 @@ def with_task(robot: Robot, task: Task) -> RobotWithTask:
     return RobotWithTask(**{item.name: getattr(robot, item.name) for item in fields(Robot)}, task=task)
 
 
-def robot_with_task(name: str) -> RobotWithTask:
+def robot_with_task(name: Path | str) -> RobotWithTask:
     """Read a robot by its name or path, with its task.
 
     >>> robot_with_task("quadrotor").task.observation_dim
@@ -231,7 +231,7 @@ def robot_with_task(name: str) -> RobotWithTask:
     robot = robot_named(name)
     if not robot.position_dim:
         raise UnknownTask(f"{robot.name} {NO_SPACE}")
-    return with_task(robot, read_task(task_path(name)))
+    return with_task(robot, read_task(task_path(str(name))))
 
 
 def robot_maybe_with_task(name: str) -> Robot:

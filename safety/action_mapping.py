@@ -78,8 +78,14 @@ def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMa
     return IDENTITY
 
 
-def cast_action(action: Any, space: gymnasium.Space[Any]) -> Any:
-    """Return the action with the type and shape of the environment's action space."""
-    if isinstance(space, gymnasium.spaces.Box):
-        return np.asarray(action, dtype=space.dtype).reshape(space.shape)
-    return action
+def action_for(control: Array, mapping: ActionMapping, space: gymnasium.Space[Any]) -> Any:
+    """Return the action for an input (m,), or for k inputs (k, m), with the type and shape of the action space.
+
+    The mapping gets a copy of the input: it and the environment may overwrite what they get.
+    """
+    action = mapping.control_to_action(control.copy())
+    if not isinstance(space, gymnasium.spaces.Box):
+        return action
+    if space.dtype is not None and space.dtype.kind in "iu":  # a cast cuts off: 28.999999999999996 became 28
+        action = np.rint(action)
+    return np.asarray(action, dtype=space.dtype).reshape(space.shape)

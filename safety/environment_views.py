@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from brakeline.errors import Mismatch
 
 # (environment, observation, info) -> the state or the obstacles
@@ -37,3 +39,12 @@ def _obstacles(env: Any, observation: Any, info: dict[str, Any]) -> Any:
 
 
 STATE, OBSTACLES = in_info("state"), _obstacles
+
+
+def copied(value: Any) -> Any:
+    """Return an observation or an info with copies of its arrays: a policy may overwrite those that it gets."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, dict):
+        return {name: copied(part) for name, part in value.items()}
+    return tuple(map(copied, value)) if type(value) is tuple else value

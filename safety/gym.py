@@ -22,8 +22,8 @@ from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import percent
-from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
-from brakeline.safety.environment_views import OBSTACLES, STATE, View
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
+from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import correction_penalty
 from brakeline.safety.gym_checks import check_robot
 from brakeline.safety.perception.image_memory import filled, memory_of
@@ -79,14 +79,15 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             filter: a method, or a client of a service, such as `SafetyClient`.
             penalty: reward for a correction as large as an input's range (`correction_penalty`).
             state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
-            obstacles: (env, observation, info) -> list of at least the obstacles within `filter.reach`. All other space
-                is free. None: only a scan shows free space. Defaults to `info["obstacles"]`. In joint space there are
-                no obstacles, so it is not called.
+            obstacles: (env, observation, info) -> list of at least the obstacles within the robot's `sight`. All other
+                space is free. None: only a scan shows free space. Defaults to `info["obstacles"]`. In joint space there
+                are no obstacles, so it is not called.
             actions: mapping between the environment's actions and the robot's inputs. Defaults to the identity.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description; with a client, to the
                 limit of the client or of its service.
-            turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on.
+            turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on. A client
+                whose backup plan asks for it does so anyway.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given. Or the environment
@@ -106,7 +107,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         check_robot(env, self.client.robot)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
         check_numbers(self, "penalty", least=0.0)
-        self.backup_plan.turn_aside = turn_aside
+        self.backup_plan.turn_aside |= turn_aside
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.action_space, self.client.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
@@ -132,12 +133,13 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return cls(env, ready(load(path_of_model(model))), penalty, **how)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._now = self.env.reset(seed=seed, options=options)
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._now = copied((observation, info))
         self.client.reset()
         self._plan = self.backup_plan.plan
         self._memory.reset()
         self._remember()
-        return self._now
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._now is None:
@@ -150,7 +152,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         proposed = np.asarray(self._actions.action_to_control(action), dtype=float)
         answer, reason = self._decide(proposed)
         executed, self._plan = self.backup_plan.next_input, self.backup_plan.plan
-        safe_action = cast_action(self._actions.control_to_action(executed), self.env.action_space)
+        safe_action = action_for(executed, self._actions, self.env.action_space)
         observation, reward, terminated, truncated, info = self.env.step(safe_action)
         if (record := getattr(self.client, "record_outcome", None)) is not None:  # of a `RecordedClient`
             ended = terminated or truncated
@@ -158,7 +160,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         penalty = correction_penalty(self.client.robot, proposed, before, executed, self.penalty)
         figures = diagnostics(answer, reason) | {"proposed": proposed, "executed": executed}
         info = info | {"safety": answer, "proposed": action, "penalty": penalty, "diagnostics": figures}
-        self._now = observation, info
+        self._now = copied((observation, info))
         self._remember()
         return observation, float(reward) - penalty, terminated, truncated, info
 

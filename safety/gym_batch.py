@@ -76,10 +76,15 @@ class BatchSafetyWrapper(VectorWrapper):
         which = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
         # Some environments take the mask out of the options that they get.
         options = None if options is None else dict(options)
-        self._observations, self._infos = self.env.reset(seed=seed, options=options)
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._keep(observations, infos)
         self.plans.reset(which)
         self._ended = self._ended & ~which
-        return self._observations, self._infos
+        return observations, infos
+
+    def _keep(self, observations: Any, infos: dict[str, Any]) -> None:
+        """Keep what the next requests are about. A policy may overwrite the states that it gets."""
+        self._infos, self._observations = infos | {"state": infos["state"].copy()}, observations
 
     def step(self, actions: Any) -> StepBatch:
         self.begin_step(actions)
@@ -93,7 +98,7 @@ class BatchSafetyWrapper(VectorWrapper):
         check_rows(proposed, self.num_envs, self.plans.robot)
         obstacles = ObstacleArrays(**self._infos["obstacles"])
         outcome = self.plans.decide(self._infos["state"], proposed, obstacles, self._observations)
-        self.env.unwrapped.begin_step(outcome.inputs)  # type: ignore[attr-defined]
+        self.env.unwrapped.begin_step(outcome.inputs.copy())  # type: ignore[attr-defined]
         self._deciding = proposed, before, outcome
         return outcome
 
@@ -117,5 +122,5 @@ class BatchSafetyWrapper(VectorWrapper):
         self._ended = terminated | truncated
         if self._mode != AutoresetMode.DISABLED:
             self.plans.reset(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
-        self._infos, self._observations = infos, observations
+        self._keep(observations, infos)
         return observations, rewards - penalty, terminated, truncated, infos

@@ -14,8 +14,8 @@ from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.robot import Array
 from brakeline.messaging.sensor_messages import RangeMeasurement
-from brakeline.safety.action_mapping import ActionMapping, mapping_for_space
-from brakeline.safety.environment_views import OBSTACLES, STATE, View
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
+from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import diagnostics, is_measurement_fault
@@ -75,10 +75,10 @@ class VectorSafetyWrapper(VectorWrapper):
         observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
         if self._now is not None:
             infos = with_earlier_rows(infos, self._now[1], ~which)
-        self._now = observations, infos
+        self._now = copied((observations, infos))
         self._begin(which)
         self._remember(infos, which)
-        return self._now
+        return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         if self._now is None:
@@ -94,7 +94,7 @@ class VectorSafetyWrapper(VectorWrapper):
         executed = np.array([plan.next_input for plan in self.backup_plans])
         executed[resets] = robot.zero_input()
         space = self.env.action_space
-        safe_actions = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
+        safe_actions = np.asarray(action_for(executed, self._actions, space), dtype=space.dtype).reshape(space.shape)
         observations, rewards, terminated, truncated, infos = self.env.step(safe_actions)
         penalty = np.zeros(self.num_envs)
         for i in deciding:
@@ -110,7 +110,7 @@ class VectorSafetyWrapper(VectorWrapper):
             "diagnostics": {name: np.array([row[name] for row in figures]) for name in figures[0]}
             | {"proposed": proposed, "executed": executed},
         }
-        self._now = observations, infos
+        self._now = copied((observations, infos))
         return observations, np.asarray(rewards) - penalty, terminated, truncated, infos
 
     def _decide(self, deciding: list[int], proposed: Array) -> tuple[dict[int, Answer], dict[int, str]]:

@@ -20,7 +20,7 @@ from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.progress import Advance, under_way
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
 from brakeline.safety.model.dataset import Dataset, Trajectory, bends
 from brakeline.safety.model.repeated_driving import without_repeats
@@ -140,7 +140,7 @@ class _Environment:
         observation, info = self.env.reset(seed=seed, options=options)
         u, built = next(inputs), TrajectoryBuilder(self._state(observation, info))
         for _ in range(most):
-            action = cast_action(self.mapping.control_to_action(u), self.env.action_space)
+            action = action_for(u, self.mapping, self.env.action_space)
             observation, _, terminated, truncated, info = self.env.step(action)
             if terminated:
                 break

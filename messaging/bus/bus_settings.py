@@ -72,6 +72,9 @@ class BusSettings:
             ValueError: there is no endpoint, or one has another form, or needs keys and there are none, or the reverse.
             BadKeys: other machines could connect, and there are no keys.
         """
+        for name in ("connect", "listen"):
+            if isinstance(value := getattr(self, name), str):
+                raise ValueError(f"{name} is a text: give a tuple of endpoints, such as ({value!r},)")
         endpoints = (*self.connect, *self.listen)
         if not endpoints:
             raise ValueError("a bus needs an endpoint: `connect` to a router, or `listen` to be one")
@@ -79,7 +82,8 @@ class BusSettings:
             if not ENDPOINT.match(endpoint):
                 raise ValueError(f"{endpoint!r} is no endpoint: give PROTOCOL/HOST:PORT, such as tcp/127.0.0.1:7447")
             if endpoint.startswith("tls/") and self.keys is None:
-                raise ValueError(f"{endpoint}: a bus at tls/ needs keys: give --keys FOLDER, or set BRAKELINE_KEYS")
+                how = "give --keys FOLDER, or set BRAKELINE_KEYS; in Python, give keys=FOLDER"
+                raise ValueError(f"{endpoint}: a bus at tls/ needs keys: {how}")
             if self.keys is not None and not endpoint.startswith("tls/"):
                 raise ValueError(
                     f"{endpoint}: with keys a bus is at tls/HOST:PORT: correct it, or leave out the keys ({self.keys})"

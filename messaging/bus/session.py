@@ -8,6 +8,7 @@ Zenoh starts threads: fork before you open a bus, or spawn processes.
 
 from __future__ import annotations
 
+import os
 import secrets
 import threading
 from collections.abc import Callable, Iterable
@@ -17,6 +18,7 @@ from typing import Any, Self
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
+from brakeline.errors import BusError
 from brakeline.messaging.bus.access_control import ALIVE
 from brakeline.messaging.bus.bundling import BundlePublisher, Unbundler
 from brakeline.messaging.bus.bus_settings import BusSettings, open_session
@@ -52,6 +54,7 @@ class Bus:
         self.settings = settings
         self.source = source
         self.run = secrets.randbits(63)
+        self._process = os.getpid()
         self.rejected = RejectedMessages()
         self._lock = threading.Lock()
         self._publishers: dict[str, Publisher] = {}
@@ -186,8 +189,11 @@ class Bus:
             NoReply: there is no service. This error does not wait for the deadline.
             Late: the deadline passed.
             Refused: the service answered with an error.
+            BusError: the bus is closed, or this process was forked after the bus was opened.
             ValueError: a name is missing or unknown.
         """
+        if os.getpid() != self._process:  # Zenoh would wait for its threads for ever
+            raise BusError("this process was forked after the bus was opened: open a bus, or a client, after the fork")
         names = {"source": self.source} | names
         return self._query_client.ask(self._full(exact_key(topic, names)), payload, timeout)
 

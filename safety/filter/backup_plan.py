@@ -41,12 +41,18 @@ class Prediction(ComparedByValue):
         """Return whether the measured state (n,) lies in the set."""
         return all(off <= most + SAME_SET for off, most in self._errors(robot, state))
 
+    def copy(self) -> Prediction:
+        """Return the same set in arrays of its own."""
+        return Prediction(self.center.copy(), self.half_width.copy(), self.heading)
+
     def share_used(self, robot: Robot, state: Array) -> float:
         """Return the share of the set that the measured state (n,) uses.
 
-        It is the largest ratio of an error to its half-width. Above 1, the state is outside; NaN gives infinity.
+        It is the largest ratio of an error, less `SAME_SET`, to its half-width. Above 1, the state is outside; NaN
+        gives infinity.
         """
-        shares = [off / most if most > 0.0 else math.inf for off, most in self._errors(robot, state) if off != 0.0]
+        beyond = [(off - SAME_SET, most) for off, most in self._errors(robot, state) if not off <= SAME_SET]
+        shares = [off / most if most > 0.0 else math.inf for off, most in beyond]
         return math.inf if any(map(math.isnan, shares)) else max(shares, default=0.0)
 
     def _errors(self, robot: Robot, state: Array) -> Iterator[tuple[float, float]]:
@@ -110,7 +116,7 @@ class BackupPlan:
     @property
     def next_input(self) -> Array:
         """(m,) the input to execute in the coming period, after `accept` or `fallback`."""
-        return self.plan[0].copy() if self.robot.late else self.input_in_force
+        return (self.plan[0] if self.robot.late else self.input_in_force).copy()
 
     @property
     def past(self) -> PastWindow | None:
@@ -125,7 +131,7 @@ class BackupPlan:
     def measured(self, state: Array) -> None:
         """Store the measured state (n,) of a period before its request; ignore it if it is not finite or misshapen."""
         if state.shape == self.seen.shape and np.isfinite(state).all():
-            self.seen, self._compare = state, True
+            self.seen, self._compare = state.copy(), True  # the caller may overwrite its array
 
     def accept(
         self,
@@ -158,7 +164,7 @@ class BackupPlan:
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
-        self.predicted = predicted if predicted is not None and len(predicted.center) else None
+        self.predicted = predicted.copy() if predicted is not None and len(predicted.center) else None
         return self._advance()
 
     @property

@@ -75,7 +75,8 @@ class Filter:
         domain (2, known): recorded range of [x_0; input in force; inputs that are decided], with room for rounding.
         inputs: the plans that the filter may verify, of recorded inputs. executable: all that the robot may follow.
         clearance_margin: distance to obstacles that the QP keeps, in the direction in which it is largest [m].
-        reach: an obstacle farther away than this cannot change a decision [m].
+        reach: an obstacle farther away than this cannot change a decision [m]. If the request widens the sets, one
+            within the robot's `sight` can.
         bound: the share of plans outside their tubes that the model set states.
         outside_share: see `Decision`.
         start: factor on the sets of a request without past window (see `OneStep.start`).

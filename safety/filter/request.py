@@ -57,7 +57,7 @@ class Request(ComparedByValue):
         action (m,): proposal.
         input_in_force (m,): input of the period before.
         plan (N, m): rest of the backup plan; in real time, from the input in force on.
-        obstacles: at least those within `Filter.reach`.
+        obstacles: at least those within the robot's `sight` of the measured position.
         model: version of the model set that verified the plan. Empty if the robot stands; `UNVERIFIED` if no model set
             verified the plan.
         predicted: predicted set of this state, from the last decision.
@@ -212,6 +212,8 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         BadRequest: the description is missing or does not fit the robot. It has the field's name.
     """
     moving = request.movers is not None and len(request.movers)
+    if not isinstance(request.known_free, bool | np.bool_):  # a text such as "no" is true
+        raise BadRequest("known_free", f"known_free is a {type(request.known_free).__name__}: give True or False")
     if not robot.position_dim:
         _check_no_space(robot, request)
     elif not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
@@ -224,17 +226,36 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         _check_past(robot, request.past)
     if not robot.position_dim:
         return
-    if request.obstacles.center.shape[1] != robot.position_dim:
-        raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
     for shapes in (request.obstacles, None if request.movers is None else request.movers.shapes):
-        if shapes is not None and len(shapes) and not _plausible(shapes):
+        if shapes is None:
+            continue
+        _check_arrays(robot, shapes)
+        if len(shapes) and not _plausible(shapes):
             raise BadRequest("obstacles", IMPOSSIBLE)
     if isinstance(request.scan, Scan) and (robot.position_dim != 2 or robot.heading is None):
         raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
+
+
+def _check_arrays(robot: Robot, shapes: Shapes) -> None:
+    """Check the arrays of obstacles: compiled code would read past the end of one that is too short.
+
+    Raises:
+        BadRequest: an array has another shape or type.
+    """
+    n, d = len(shapes), robot.position_dim
+    if shapes.center.shape[1:] != (d,):
+        raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {d} coordinates")
+    sizes = {"center": (n, d), "axes": (n, d, d), "half": (n, d), "rho": (n,), "round": (n, d), "margin": (n,)}
+    for name, size in sizes.items():
+        part = getattr(shapes, name)
+        if part.shape != size or part.dtype != float or not part.flags.writeable:
+            found = f"shape {part.shape} and type {part.dtype}{'' if part.flags.writeable else ', read-only'}"
+            why = f"obstacles.{name} has {found}; {n} obstacles need {size} and float64, writable: use Shapes.of"
+            raise BadRequest("obstacles", why)
 
 
 def _plausible(shapes: Shapes) -> bool:
@@ -319,8 +340,10 @@ def check_motion(robot: Robot, request: Request, further: Named) -> None:
     }
     _sized(robot, "action", request.action, inputs)
     _finite(robot, named | further)
-    if max(map(abs, request.state.tolist())) > FARTHEST:  # in any unit
-        raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
+    if max(sizes := [abs(value) for value in request.state.tolist()]) > FARTHEST:  # in any unit
+        at = sizes.index(max(sizes))
+        why = f"{robot.state[at]} is {request.state[at]:g}; use SI units, and an origin near the robot"
+        raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible: {why}")
     _within_bounds(robot, "input_in_force", request.input_in_force)
 
 

@@ -7,6 +7,7 @@ robot with a blind sector could never move, because its body would touch occupie
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections import deque
@@ -99,8 +100,8 @@ class VisibilityMemory(ABC, Generic[S]):
         self._begun = True
         if scan is None:
             if self._last is None:
-                return self.nothing
-            return replace(self._last, age=min(self._last.age + self._since_last, VERY_OLD))
+                return _apart(self.nothing)
+            return _apart(replace(self._last, age=min(self._last.age + self._since_last, VERY_OLD)))
         scan, self._used = self._copied(scan), True
         if self._first is None:
             self._first = scan
@@ -114,7 +115,7 @@ class VisibilityMemory(ABC, Generic[S]):
             filled = replace(scan, ranges=ranges)
         self._store(scan)
         self._last, self._since_last = filled, 0.0
-        return filled
+        return _apart(filled)
 
     @abstractmethod
     def _copied(self, scan: S) -> S:
@@ -138,6 +139,13 @@ class VisibilityMemory(ABC, Generic[S]):
         moved = scan is not self._first
         drift = 2.0 * scan.position_error * moved + scan.speed * self._since_start + step
         return np.asarray(np.linalg.norm(points - _position(self._first), axis=-1) <= self._start_radius - drift)
+
+
+def _apart(scan: S) -> S:
+    """Return a scan with ranges of its own, which the caller may overwrite; their values need no second check."""
+    other = copy.copy(scan)
+    object.__setattr__(other, "ranges", scan.ranges.copy())
+    return other
 
 
 def _position(scan: Scan | RangeImage) -> Array:
@@ -189,8 +197,8 @@ class FanMemory(VisibilityMemory[Scan]):
         if scan is None:
             return filled
         tracks = self._tracker.follow(scan).tracks
-        if tracks is not None:
-            self._last = filled = replace(filled, tracks=tracks)
+        if tracks is not None and self._last is not None:
+            self._last, filled = replace(self._last, tracks=tracks), replace(filled, tracks=tracks)
         return filled
 
     def _copied(self, scan: Scan) -> Scan:

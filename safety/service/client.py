@@ -77,18 +77,24 @@ def request_message(
         observation=observation_in(observation).tolist(),
         known_free=known_free_in(known_free),
         turn_aside=backup_plan.turn_aside,
-        actor=actor,
-        episode=episode,
-        step=step,
-        time=time,
-        fleet=fleet,
         widening=backup_plan.widening.factor,
         state_widening=backup_plan.widening.state_factor,
         acceleration_age=backup_plan.acceleration_age,
     )
+    _set_labels(message, actor=actor, episode=episode, step=step, time=time, fleet=fleet)
     set_measurement(message, scan_in(scan))
     _set_history(message, backup_plan)
     return message
+
+
+def _set_labels(message: pb.Request, **labels: Any) -> None:
+    """Set the fields that name a request, for the log and for plan tokens. Raises BadRequest for another type."""
+    for name, value in labels.items():
+        try:
+            message.MergeFrom(pb.Request(**{name: value}))
+        except (TypeError, ValueError) as error:
+            give = "give texts as actor and fleet, whole numbers from 0 as episode and step, and seconds as time"
+            raise BadRequest(name, f"{name} is {value!r:.80}: {give}") from error
 
 
 def _set_history(message: pb.Request, backup_plan: BackupPlan) -> None:
@@ -230,7 +236,7 @@ def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> 
 class BusClient:
     """A client over a bus, for robots of one kind. It closes the bus if it opened it."""
 
-    def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
+    def __init__(self, bus: Bus, robot: Robot | Path | str, deadline: float) -> None:
         """Make a client.
 
         Args:
@@ -245,7 +251,7 @@ class BusClient:
         if not (isinstance(deadline, int | float | np.number) and 0.0 < deadline <= LONGEST_DEADLINE):  # NaN fails too
             raise ValueError(f"a deadline is a time above 0 and at most {LONGEST_DEADLINE:g} s, not {deadline!r}")
         self.bus, self.deadline = bus, deadline
-        self.robot = robot_named(robot) if isinstance(robot, str) else robot
+        self.robot = robot if isinstance(robot, Robot) else robot_named(robot)
         self._owned = False
 
     @classmethod
@@ -274,15 +280,17 @@ class BusClient:
 class SafetyClient(BusClient):
     """Requests decisions about one robot from the safety service, and keeps its backup plan.
 
-    Use a client in one thread at a time. With several robots, use one client for each, or a `FleetClient` for robots
-    that share a world.
+    Use a client in one thread at a time, and in the process that opened it: a process that is forked later gets no
+    answers. With several robots, use one client for each, or a `FleetClient` for robots that share a world.
 
     >>> with SafetyClient.open(ENDPOINT, "ground", deadline=5.0) as safety:  # of `brakeline safety ground --listen …`
     ...     safety.decide([0, 0, 0, 0, 0], [0.25, 0], [Obstacle("cylinder", (0.4, 0.0), (0.1,))]).kind
     'allowed'
     """
 
-    def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE, acceleration_age: float = 0.0) -> None:
+    def __init__(
+        self, bus: Bus, robot: Robot | Path | str, deadline: float = DEADLINE, acceleration_age: float = 0.0
+    ) -> None:
         """acceleration_age: your states hold the horizontal acceleration of this long ago [s]."""
         super().__init__(bus, robot, deadline)
         self.backup_plan = BackupPlan(self.robot, acceleration_age=acceleration_age)
@@ -291,7 +299,7 @@ class SafetyClient(BusClient):
     def open(
         cls,
         connect: str | Sequence[str],
-        robot: Robot | str,
+        robot: Robot | Path | str,
         deadline: float = DEADLINE,
         keys: Path | str | None = None,
         name: str = "client",

@@ -1,6 +1,6 @@
 """The interface of every client of the filter, in process or over the bus.
 
-answer = client.decide(state, action, obstacles)               # obstacles: at least those within reach
+answer = client.decide(state, action, obstacles)               # obstacles: at least those within sight
 answer = client.decide(state, action, scan=scan)               # what the scan does not show to be free is occupied
 answer = client.decide(state, action, [], known_free=True)     # a map says that all space within reach is free
 """
@@ -83,7 +83,7 @@ class FilterClient(Protocol):
             state: (n,) measured, in the order and the units of the robot's description (`Robot.state`).
             action: (m,) proposed, in the order and the units of the description (`Robot.action`). If it holds NaN or
                 infinity, the decision is a failsafe.
-            obstacles: at least those within reach (1 m is enough for `ground`).
+            obstacles: at least those within the robot's `sight` of the measured position (1 m for `ground`).
             scan: a sensor's measurement, instead of obstacles or in addition: a `Scan`, or a `RangeImage` in space.
                 Fill it in with `brakeline.filled` first.
             observation: the task's observation. Only the rivals read it.
@@ -111,7 +111,9 @@ def vector_in(name: str, value: ArrayLike) -> Array:
         if vector.dtype.kind not in "fiubO":  # texts and complex numbers can be converted, but not as they are meant
             raise TypeError(f"an array of {vector.dtype}")
         vector = np.asarray(vector, float)
-    except (TypeError, ValueError) as error:
+        if isinstance(value, np.ma.MaskedArray):  # a masked number is missing
+            vector = np.where(np.ma.getmaskarray(value), np.nan, vector)
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadRequest(name, f"{name} is a {type(value).__name__}: give a list of numbers") from error
     if vector.ndim != 1:
         raise BadRequest(name, f"{name} has shape {vector.shape}: give a list of numbers")

@@ -40,7 +40,7 @@ class FleetClient(BusClient):
     ['allowed', 'allowed']
     """
 
-    def __init__(self, bus: Bus, robot: Robot | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
+    def __init__(self, bus: Bus, robot: Robot | Path | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
         """Make a client for robots of one kind; names: of the robots.
 
         Raises:
@@ -60,7 +60,7 @@ class FleetClient(BusClient):
     def open(
         cls,
         connect: str | Sequence[str],
-        robot: Robot | str,
+        robot: Robot | Path | str,
         names: Sequence[str],
         deadline: float = DEADLINE,
         keys: Path | str | None = None,
@@ -96,6 +96,11 @@ class FleetClient(BusClient):
         """
         nothing: list[None] = [None] * len(self.names)
         local_maps = nothing if obstacles is None else obstacles, nothing if scans is None else scans
+        for name, values in zip(
+            ("states", "actions", "obstacles", "scans"), (states, actions, *local_maps), strict=True
+        ):
+            if len(values) != len(self.names):
+                raise ValueError(f"{name} has {len(values)} entries: give one for each of {', '.join(self.names)}")
         robots = zip(self.names, self.backup_plans, states, actions, *local_maps, strict=True)
         requests = [
             request_message(

@@ -1,5 +1,7 @@
 """The front door: the names that `brakeline` offers, what an installed package holds, and what needs no extra."""
 
+import copy
+import inspect
 import os
 import subprocess
 import sys
@@ -11,8 +13,10 @@ from pathlib import Path
 import pytest
 
 import brakeline
+from brakeline import errors
 from brakeline.extras import EXTRAS
 from brakeline.logs.viewer import SCRIPTS, STYLES
+from brakeline.messaging import brakeline_pb2 as pb
 
 ROOT = Path(__file__).parents[2]
 # The names, the files and the decisions are tested here, so the kernels of another folder are not compiled: it takes
@@ -35,6 +39,35 @@ def test_the_table_of_names_is_complete():
     assert lazy | errors | {"__version__"} == set(brakeline.__all__)
     with pytest.raises(AttributeError, match="SafetyClient"):
         _ = brakeline.SaftyClient
+
+
+EXCEPTIONS = [one for one in vars(errors).values() if inspect.isclass(one) and issubclass(one, errors.BrakelineError)]
+ARGUMENTS = {  # by annotation
+    "str": "state",
+    "str | InvalidField": "state",
+    "Path": Path("part"),
+    "pb.Error": pb.Error(type="BadRequest", field="state", message="why"),
+    "Sequence[tuple[str, str]]": [("field", "mistake")],
+    "dict[str, str]": {"column": "why"},
+}
+
+
+@pytest.mark.parametrize("kind", EXCEPTIONS)
+def test_an_exception_reaches_another_process_as_it_is(kind):
+    """By the same protocol as a copy. `multiprocessing.Pool` waited for ever for a `BadRequest` of a worker."""
+    own = inspect.signature(kind).parameters.values() if inspect.isfunction(kind.__init__) else ()
+    error = kind(*(ARGUMENTS[one.annotation] for one in own)) if own else kind("why")
+    error.add_note("in episode 3")
+    for other in (copy.copy(error), copy.deepcopy(error)):
+        assert type(other) is kind and str(other) == str(error) and vars(other) == vars(error)
+
+
+@pytest.mark.parametrize("kind", [errors.BadRequest, errors.BadShape, errors.StaleModel])
+def test_an_exception_that_gymnasium_raises_anew_says_the_same(kind):
+    """`AsyncVectorEnv` raised `TypeError: missing 1 required positional argument` in its place."""
+    error = kind("state", "state has another shape")
+    again = kind(error)
+    assert (str(again), again.field) == (str(error), error.field)
 
 
 CLIENT = "from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground')"

@@ -2,6 +2,7 @@
 had come alone.
 """
 
+import os
 import signal
 import threading
 import time
@@ -175,6 +176,13 @@ def test_an_endpoint_without_protocol_or_address_is_refused_at_once(wrong: str) 
         BusSettings(connect=(wrong,)).check()
 
 
+def test_settings_of_python_are_refused_with_what_to_give_in_python() -> None:
+    with pytest.raises(ValueError, match="in Python, give keys=FOLDER"):
+        BusSettings(connect=("tls/127.0.0.1:7447",)).check()
+    with pytest.raises(ValueError, match=r"connect is a text: give a tuple .* \('tcp/127.0.0.1:7447',\)"):
+        BusSettings(connect="tcp/127.0.0.1:7447").check()  # type: ignore[arg-type]
+
+
 def test_a_client_waits_for_its_router(join: Join) -> None:
     opened: list[Bus] = []
     waiting = threading.Thread(target=lambda: opened.append(join("actor-0", patience=10.0)))
@@ -203,6 +211,20 @@ def test_closing_ends_the_handlers_and_what_comes_after_is_an_error(join: Join) 
         publisher.put(pb.Health())
     with pytest.raises(BusError, match="cannot ask"):
         bus.ask(DECIDE, b"", timeout=0.1, robot="ground")
+
+
+def test_a_forked_process_cannot_ask_and_says_so_at_once(join: Join) -> None:
+    """Zenoh's threads are not in it: it waited for ever, whatever its deadline, and its robot drove on."""
+    bus = join("client", listen=True)
+    if not (child := os.fork()):
+        signal.alarm(5)  # ends a child that hangs
+        try:
+            bus.ask(DECIDE, b"?", timeout=0.5, robot="ground")
+        except BusError as error:
+            os._exit(7 if "open a bus, or a client, after the fork" in str(error) else 1)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 
 def test_keys_of_nobody_and_too_many_are_passed_over(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:

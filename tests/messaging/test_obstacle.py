@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.errors import BadShape
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes, rotate
-from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.obstacle_motion import Motion, Sighting
 
 pytestmark = pytest.mark.fast
 
@@ -155,3 +156,19 @@ def test_what_is_no_obstacle_in_the_plane_is_refused_by_its_field(field, argumen
     with pytest.raises(BadShape) as caught:
         Shapes.of([Obstacle(*arguments)], 2)
     assert caught.value.field == field
+
+
+def test_an_obstacle_stays_where_it_was_when_its_owner_overwrites_an_array():
+    """A Kalman filter updates its state in place: the earlier sighting moved along, so no jump ever broke a bound."""
+    tracked, size = np.array([1.0, 0.0, -0.5, 0.0]), [0.2]
+    first = Obstacle(CYLINDER, tracked[:2], size, motion=Motion(tracked[2:], 0.03, acceleration=1.0))
+    tracked += [0.5, 0.0, 0.1, 0.0]
+    size[0] = 0.01
+    assert first == Obstacle(CYLINDER, (1.0, 0.0), (0.2,), motion=Motion((-0.5, 0.0), 0.03, acceleration=1.0))
+    assert len({first, first}) == 1
+    before = Sighting(first.position, first.motion.velocity, since=0.2)
+    second = Obstacle(CYLINDER, tracked[:2], (0.2,), motion=Motion(tracked[2:], 0.03, acceleration=1.0, before=before))
+    assert not MovingObstacles.of([second], 2).consistent.any(), "it jumped by half a metre"
+    kept = Sighting(tracked[:2], tracked[2:], since=0.2)
+    tracked[:] = 0.0
+    assert kept == Sighting((1.5, 0.0), (-0.4, 0.0), since=0.2)

@@ -195,12 +195,15 @@ def test_a_file_is_found_by_its_path_and_never_by_its_name(tmp_path):
     (tmp_path / "my.toml").write_text(text)
     robot = robot_named(str(tmp_path / "my.toml"))
     assert robot.name == "minted" and robot == replace(robot_named("ground"), name="minted")
+    assert robot_named(tmp_path / "my.toml") == robot, "a path need not be a text"
+    (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    assert robot_named(tmp_path / "marked.toml") == robot, "an editor of Windows wrote it"
     assert robot_named(f"{tmp_path / 'my.toml'}-late") == robot.in_real_time()
     with pytest.raises(UnknownRobot, match=r"no robot is called 'minted'.*ground") as caught:
         robot_named("minted")
     assert caught.value.field == "robot"
     with pytest.raises(UnknownTask, match="minted has no task"):
-        robot_with_task(str(tmp_path / "my.toml"))
+        robot_with_task(tmp_path / "my.toml")
     assert robot_maybe_with_task(str(tmp_path / "my.toml")) == robot
     with pytest.raises(UnknownTask, match="minted has no task"):
         needs_task(robot)

@@ -1,5 +1,6 @@
 """Batches decide as the single path does: the same kinds, the same inputs, and nothing verified that it would not."""
 
+import copy
 from dataclasses import replace
 from functools import cache
 
@@ -142,6 +143,7 @@ def test_a_batch_decides_as_the_single_path(filters, form):
     kinds = {KINDS[kind] for row, kind in enumerate(answers.kind) if row not in answers.singly}
     assert {ALLOWED, ADJUSTED} <= kinds <= {ALLOWED, ADJUSTED, FAILSAFE}
     assert len(answers.singly) < 0.5 * len(requests)
+    assert all(answers.row(row - 100).reason == answers.row(row).reason for row in range(100)), "from the end"
 
 
 @pytest.mark.parametrize("form", ["ground direct", "two discs", "one-step"])
@@ -236,6 +238,14 @@ def test_past_windows_are_scored():
     answers = check_same(ready, requests)
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
     assert (answers.plan_score < answers.score)[answers.scored].any()
+
+
+def test_a_filter_that_has_decided_a_batch_can_be_copied():
+    """A vector of many environments has one: it could not be given to other processes any more."""
+    ready = Filter.load("ground")
+    requests = RequestArrays.of(scenes(ready, 20))
+    answers = ready.decide_batch(requests)
+    assert np.array_equal(copy.deepcopy(ready).decide_batch(requests).plan, answers.plan)
 
 
 def test_row_by_row_a_filter_states_what_it_states_in_each_row():

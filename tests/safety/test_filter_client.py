@@ -11,14 +11,15 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, check_for_filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, NOT_FINITE, check_for_filter
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.service.client import SafetyClient
+from brakeline.safety.service.client import SafetyClient, request_message
 from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.fleet_client import FleetClient
 from brakeline.safety.service.in_process import InProcess
@@ -87,6 +88,23 @@ def test_without_a_decision_every_client_goes_on_with_its_backup_plan(client):
     assert not client.backup_plan.input_in_force.any()
 
 
+def test_a_caller_may_overwrite_the_arrays_that_it_gives_and_gets(client):
+    """A driver scales the returned input to its own unit in place; the next request must have it as executed."""
+    state, plan = np.zeros(5), np.array([[0.2, 0.1], [0.1, 0.0], [0.0, 0.0]])
+    predicted = Prediction(np.zeros(5), np.full(5, 0.1), 0.0)
+    client.backup_plan.measured(state)
+    state += 1.0
+    assert not client.backup_plan.seen.any()
+    client.backup_plan.accept(plan, "v", predicted, True)
+    predicted.center[:2] += 100.0  # to a map's origin
+    assert client.backup_plan.still_verified and not client.backup_plan.predicted.center.any()
+    for step in (lambda: client.backup_plan.accept(plan, "v", None, True), client.fallback):
+        returned = step()
+        executed = returned.copy()
+        returned *= 0.5
+        assert np.array_equal(client.backup_plan.input_in_force, executed)
+
+
 def test_the_clients_have_the_same_parameters():
     wanted = list(signature(FilterClient.decide).parameters.values())
     for kind in (SafetyClient, InProcess):
@@ -121,13 +139,25 @@ def test_a_value_of_another_type_is_refused_with_its_field(client, field, more, 
 @pytest.mark.parametrize("field", ["state", "action"])
 @pytest.mark.parametrize(
     "value",
-    [None, 0.2, "abc", ["0.1", "0.2"], {}, [[0.1, 0.2]], [0.1, [0.2]], np.array([0.1 + 1j, 0.2]), [object()] * 2],
-    ids=["none", "number", "text", "texts", "dict", "nested", "ragged", "complex", "objects"],
+    [
+        *(None, 0.2, "abc", ["0.1", "0.2"], {}, [[0.1, 0.2]], [0.1, [0.2]], np.array([0.1 + 1j, 0.2])),
+        *([object()] * 2, [10**400] * 2),
+    ],
+    ids=["none", "number", "text", "texts", "dict", "nested", "ragged", "complex", "objects", "no double"],
 )
 def test_a_vector_of_another_type_is_refused_with_its_field(client, field, value):
     with pytest.raises(BadRequest, match=f"{field} .*: give a list of numbers") as caught:
         client.decide(**{"state": np.zeros(5), "action": [0.25, 0.0], field: value}, known_free=True)
     assert caught.value.field == field
+
+
+def test_a_masked_number_is_missing(ready):
+    """NumPy drops a mask without a word, and what lies below it is any number."""
+    state, action = np.ma.array(np.zeros(5), mask=[0, 1, 0, 0, 0]), np.ma.array([0.25, 0.0], mask=[1, 0])
+    safety = InProcess(ready, accept_bound=1.0)
+    assert safety.decide(np.zeros(5), action, known_free=True).reason == NOT_FINITE
+    with pytest.raises(BadRequest, match="state holds NaN"):
+        safety.decide(state, [0.25, 0.0], known_free=True)
 
 
 @pytest.mark.parametrize("deadline", [float("nan"), float("inf"), -1.0, 0.0, 1e300, None, "0.1"])
@@ -138,6 +168,20 @@ def test_a_deadline_that_no_query_can_have_is_refused(join, endpoint, deadline):
             make()
     with pytest.raises(ValueError, match="a deadline is"):
         SafetyClient.open(endpoint, "ground", deadline)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("episode", -1), ("step", 2**40), ("step", 1.5), ("actor", 3), ("time", "now"), ("fleet", [1, 2])],
+)
+def test_a_label_of_another_type_is_refused_with_its_field(field, value):
+    with pytest.raises(BadRequest, match="give texts as actor and fleet, whole numbers from 0 as episode") as caught:
+        request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), **{field: value})
+    assert caught.value.field == field
+
+
+def test_a_client_takes_the_path_of_a_description(join):  # noqa: F811
+    assert SafetyClient(join("client", listen=True), ROBOTS_FOLDER / "ground.toml").robot.layout() == GROUND.layout()
 
 
 @IN_PROCESS_OR_SERVED
@@ -257,12 +301,17 @@ def test_a_fleet_needs_known_free_space(fleet):
     assert {answer.kind for answer in fleet.decide(*questions, scans=walls)} == {"failsafe"}
 
 
+@pytest.mark.parametrize("name", ["states", "actions", "obstacles", "scans"])
+def test_a_fleet_needs_an_entry_for_each_robot_and_the_error_names_what_lacks_one(fleet, name):
+    given = {"states": [np.zeros(5)] * 2, "actions": [np.zeros(2)] * 2, "obstacles": [[], []], "scans": [None, None]}
+    with pytest.raises(ValueError, match=f"{name} has 3 entries: give one for each of {', '.join(NAMES)}"):
+        fleet.decide(**(given | {name: given[name] + given[name][:1]}), known_free=True)
+
+
 def test_a_malformed_fleet_is_refused(fleet):
     for names in ((), ("alone",), ("same", "same")):
         with pytest.raises(ValueError, match="two robots or more"):
             FleetClient(fleet.bus, "ground", names)
-    with pytest.raises(ValueError, match="zip"):
-        fleet.decide([np.zeros(5)], [[0.1, 0.0]] * 2, [[], []])
 
 
 def test_a_name_or_a_model_set_is_no_filter_and_the_error_says_what_to_give() -> None:

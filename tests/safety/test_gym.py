@@ -11,7 +11,7 @@ from brakeline.deploy.data.environment_episodes import collect
 from brakeline.errors import BadData, BadModel, BadRequest, Mismatch, NoReply
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
-from brakeline.safety.action_mapping import ActionMapping, mapping_for_space, normalised
+from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space, normalised
 from brakeline.safety.environment_views import STATE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
@@ -143,6 +143,89 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     diagnostics = info["diagnostics"]
     assert not diagnostics["executed"].any() and np.isfinite(reward)
     assert (diagnostics["kind"], diagnostics["verified"], diagnostics["reason"]) == ("failsafe", True, NOT_FINITE)
+
+
+class Overwriting(Toy):
+    """An environment that takes inputs, and halves the array that it gets."""
+
+    action_space = gymnasium.spaces.Box(CAR.low(), CAR.high(), dtype=np.float64)
+
+    def step(self, action):
+        self.got = action.copy()
+        action *= 0.5
+        return super().step(normalised(CAR).control_to_action(self.got).astype(np.float32))
+
+
+def mirrored(inputs):
+    """Change the sign of the curvature in place."""
+    inputs[..., 1] *= -1.0
+    return inputs
+
+
+@pytest.mark.parametrize("actions", [None, ActionMapping(lambda action: action * [1.0, -1.0], mirrored)])
+@pytest.mark.parametrize("many", [False, True])
+def test_an_environment_or_a_mapping_that_overwrites_what_it_gets_changes_no_figure(ready, many, actions):
+    """The executed input is the input in force of the next request: it was the overwritten one."""
+    toy, free = Overwriting(CAR), (lambda *_: [[]]) if many else near
+    env = wrapped(toy, ready, many, penalty=1.0, state=seen, obstacles=free, actions=actions)
+    proposed = np.array([0.4, 0.6])
+    for _ in range(3):
+        _, reward, *_, info = env.step(proposed[None] if many else proposed)
+        executed = np.reshape(info["diagnostics"]["executed"], 2)
+        sign = 1.0 if actions is None else -1.0
+        plan = env.backup_plans[0] if many else env.backup_plan
+        assert np.array_equal(toy.got, executed * [1.0, sign]) and np.array_equal(executed, plan.input_in_force)
+        assert np.array_equal(executed, [0.4, 0.6 * sign]) and not np.any(reward)
+
+
+class Informed(Toy):
+    """It also reports the state in an info, as a plain array and in a dict."""
+
+    def reset(self, **how):
+        observation, _ = super().reset(**how)
+        return observation, {"state": observation.copy(), "more": {"state": observation.copy()}}
+
+    def step(self, action):
+        observation, *ended, _ = super().step(action)
+        return observation, *ended, {"state": observation.copy(), "more": {"state": observation.copy()}}
+
+
+@pytest.mark.parametrize("place", [lambda o, i: o, lambda o, i: i["state"], lambda o, i: i["more"]["state"]])
+@pytest.mark.parametrize("many", [False, True])
+def test_a_policy_that_overwrites_what_it_observes_changes_no_decision(ready, many, place):
+    """A policy normalises its observation in place. The next request measured that."""
+    free = (lambda *_: [[]]) if many else near
+    how = HOW | {"state": lambda env, observation, info: place(observation, info), "obstacles": free}
+    env, sound = (wrapped(Informed(CAR), ready, many, **how) for _ in range(2))
+    action, returned = np.full((1, 2) if many else 2, 0.3, np.float32), env.reset(seed=0)
+    sound.reset(seed=0)
+    for _ in range(4):
+        place(*returned)[...] = 3.0
+        observation, *_, info = env.step(action)
+        returned, (*_, wanted) = (observation, info), sound.step(action)
+        assert np.array_equal(info["safety"], wanted["safety"]) if many else info["safety"] == wanted["safety"]
+
+
+@pytest.mark.parametrize("centimetres", [0, 28, 29, 57, 58, 60])
+def test_an_action_in_whole_units_is_the_input_that_was_decided(centimetres):
+    space = gymnasium.spaces.Box(0, 60, (2,), np.int32)
+    in_cm = ActionMapping(lambda action: action / 100.0, lambda control: 100.0 * control)
+    action = action_for(in_cm.action_to_control(np.array([centimetres, 0])), in_cm, space)
+    assert action.dtype == np.int32 and action.tolist() == [centimetres, 0]
+
+
+@pytest.mark.parametrize("asked", [False, True])
+@pytest.mark.parametrize("wanted", [False, True])
+def test_a_wrapper_leaves_a_client_that_turns_aside_as_it_is(ready, asked, wanted):
+    client = InProcess(ready, accept_bound=1.0)
+    client.backup_plan.turn_aside = asked
+    assert wrapped(Toy(CAR), client, turn_aside=wanted, **HOW).backup_plan.turn_aside == (asked or wanted)
+
+
+def test_collecting_from_an_environment_that_overwrites_its_actions_records_what_was_driven():
+    env = Overwriting(CAR)
+    data = collect(env, CAR, 30, held=8, state=seen, shown=False)
+    assert np.array_equal(data.trajectories[-1].inputs[-1], env.got)
 
 
 def test_every_episode_starts_standing(ready):

@@ -192,6 +192,25 @@ def test_a_step_that_resets_a_robot_compares_and_costs_nothing() -> None:
     env.close()
 
 
+class Overwriting(BatchNavigationEnv):
+    """It overwrites the inputs that it gets."""
+
+    def begin_step(self, inputs: Any) -> None:
+        super().begin_step(inputs.copy())
+        inputs[:] = 0.0
+
+
+def test_an_environment_that_overwrites_its_inputs_changes_no_figure() -> None:
+    env = BatchSafetyWrapper(Overwriting(GROUND, 2, "open"), SAFETY, penalty=1.0)
+    env.reset(seed=0)
+    *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
+    assert np.array_equal(infos["executed"], env.plans.input_in_force) and not infos["penalty"].any()
+    infos["state"][:] = 3.0
+    *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
+    assert infos["outcome"].answers.contained.all(), "a policy that overwrites a state changes no request"
+    env.close()
+
+
 def test_the_wrapper_refuses_an_environment_whose_steps_it_would_bypass() -> None:
     """It steps the innermost environment itself, so a wrapper inside it would see resets, and no steps."""
     env = BatchNavigationEnv(GROUND, 2)

@@ -104,3 +104,37 @@ def test_the_type_and_layout_of_arrays_do_not_change_the_decision(ready):
     assert same(ready.decide(replace(sound, plan=sound.plan.astype(int))), expected)
     rest, whole = ready.standing_reservation(np.zeros(5)), ready.standing_reservation(np.zeros(5, np.float32))
     assert np.array_equal(rest.center, whole.center) and np.array_equal(rest.half_width, whole.half_width)
+
+
+ARRAYS = {
+    "a radius missing": {"rho": np.full(1, 0.1)},
+    "no radii": {"rho": np.zeros(0)},
+    "axes in space": {"axes": np.tile(np.eye(3), (2, 1, 1))},
+    "single precision": {"half": np.zeros((2, 2), np.float32)},
+    "flags": {"round": np.ones((2, 2), dtype=bool)},
+    "one margin": {"margin": np.zeros(1)},
+    "read-only": {"axes": np.broadcast_to(np.eye(2), (2, 2, 2))},
+}
+
+
+@pytest.mark.parametrize("changed", ARRAYS.values(), ids=ARRAYS)
+def test_obstacles_whose_arrays_do_not_fit_are_refused(ready, changed):
+    """With a radius missing, the last obstacle did not count; compiled code read past the end of other short arrays."""
+    two = Shapes.of([cylinder(3.0, 0.0), cylinder(0.3, 0.0)], 2)
+    with pytest.raises(BadRequest, match=r"obstacles\..* need .* float64, writable: use Shapes\.of") as caught:
+        ready.decide(request(obstacles=replace(two, **changed)))
+    assert caught.value.field == "obstacles"
+
+
+def test_known_free_must_be_a_truth_value(ready):
+    with pytest.raises(BadRequest, match="known_free is a str: give True or False") as caught:
+        ready.decide(request(known_free="no"))
+    assert caught.value.field == "known_free"
+
+
+def test_a_position_on_the_globe_is_refused_with_what_to_do(ready):
+    """Coordinates of a map projection, such as UTM, leave no digits for millimetres."""
+    with pytest.raises(
+        BadRequest, match=r"a state beyond ±10000 .* y \[m\] is 5\.33e\+06; .* an origin near the robot"
+    ):
+        ready.decide(request(state=(691_000.0, 5_330_000.0, 0.0, 0.0, 0.0)))

@@ -132,6 +132,16 @@ def test_ranges_in_millimetres_do_not_show_free_space(robot, sensed, change):
         request_of(message, robot)
 
 
+@pytest.mark.parametrize("far", [3.5, 20.0])
+def test_a_masked_beam_shows_no_free_space(far):
+    """A driver masks the beams that hit the robot's own mast; NumPy drops a mask without a word."""
+    ranges = np.ma.masked_less(np.full((30, 60), far), 100.0)
+    assert not Scan(ranges[0], FAN[:60], (0.0,) * 3, far=far).valid_beams.any()
+    assert not RangeImage(ranges, (0.0,) * 3, far=far).valid_beams.any()
+    ranges.mask = False
+    assert RangeImage(ranges, (0.0,) * 3, far=far).valid_beams.all()
+
+
 def test_a_batch_may_hold_24_images_but_not_48():
     image = RangeImage(np.ones((90, 180)), (0.0, 0.0, 0.0))
     message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)

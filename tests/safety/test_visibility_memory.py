@@ -143,13 +143,23 @@ def test_after_a_jump_of_the_clock_everything_in_memory_is_old(elapsed, speed):
 @pytest.mark.parametrize("memory", [FanMemory(0.105), ImageMemory(0.3)])
 def test_overwriting_the_callers_array_does_not_change_the_memory(memory):
     beams = np.full(36, 0.5) if isinstance(memory, FanMemory) else np.full((30, 60), 0.5)
-    angles = np.linspace(-math.pi, math.pi, 36, endpoint=False)
-    memory.fill(Scan(beams, angles, (0.0, 0.0, 0.0)) if beams.ndim == 1 else RangeImage(beams, (0.0, 0.0, 0.0)), 0.2)
+    angles, state = np.linspace(-math.pi, math.pi, 36, endpoint=False), np.zeros(5)
+    where = state[:3]  # moves with the robot
+    memory.fill(Scan(beams, angles, where) if beams.ndim == 1 else RangeImage(beams, where), 0.2)
     beams[:] = 3.0
     angles += 1.0
+    state += 1.0
     last = memory.fill(None, 0.2)
     assert (last.ranges == 0.5).all()
     assert beams.ndim == 2 or last.angles[0] == -math.pi
+    assert (last.pose if beams.ndim == 1 else last.at) == (0.0, 0.0, 0.0)
+    last.ranges[:] *= 1000.0  # for a display in mm
+    again = memory.fill(None, 0.2)
+    again.ranges[:] *= 1000.0
+    assert (memory.fill(None, 0.2).ranges == 0.5).all()
+    memory.reset()
+    memory.fill(None, 0.2).ranges[:] = 3.0
+    assert not memory.nothing.valid_beams.any()
 
 
 @pytest.mark.parametrize("low", [-90.0, -89.0, -45.0])

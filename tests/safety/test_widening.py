@@ -11,6 +11,8 @@ from hypothesis.extra.numpy import arrays
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
+from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch
+from brakeline.safety.filter.batch.request_arrays import PredictionArrays
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.widening import MODELS, MOST, RESERVE, WINDOWS, PastWindow, Widening, widening_factor
@@ -212,6 +214,19 @@ def test_a_set_without_width_or_a_number_is_used_up(state):
     center = np.pad(np.array(state), (0, 3))
     assert Prediction(center, np.zeros(5), 0.0).share_used(ROBOT, np.zeros(5)) == np.inf
     assert Prediction(np.zeros(5), np.zeros(5), 0.0).share_used(ROBOT, np.zeros(5)) == 0.0
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-12, 0.9e-9, 1.1e-9, 0.05, 0.0999, 0.1001, 0.3])
+@pytest.mark.parametrize("width", [0.0, 1e-16, 1e-9, 0.1])
+def test_a_set_is_used_up_where_the_state_is_outside_and_rounding_uses_nothing(off, width):
+    """A simulator's exact coordinate has a width of 1e-16: rounding widened all sets by 2.6 and more."""
+    sets = Prediction(np.zeros(5), np.array([0.5, 0.5, 0.5, width, 0.5]), 0.0)
+    state = np.array([0.0, 0.0, 0.0, off, 0.0])
+    used = sets.share_used(ROBOT, state)
+    assert (used > 1.0) == (not sets.contains(ROBOT, state)) and (off > 1e-9 or used == 0.0)
+    plans = BackupPlanBatch(ready(), 1)
+    plans.predicted = PredictionArrays(sets.center[None], sets.half_width[None], np.zeros(1), np.ones(1, dtype=bool))
+    assert plans._shares_used(state[None])[0] == used and plans.contains(state[None])[0] == (used <= 1.0)
 
 
 def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_scores():

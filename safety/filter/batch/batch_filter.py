@@ -42,6 +42,10 @@ class BatchFilter:
         self.covers = bool(robot.position_dim) and not robot.limits and not robot.feedback
         self._prepared: dict[tuple[str, str], LaneDecisions] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy gets. It prepares its own arrays: these hold their namespace, a module."""
+        return vars(self) | {"_prepared": {}}
+
     def decide(self, requests: RequestArrays) -> DecisionArrays:
         """Decide on a batch of requests: see `Filter.decide_batch`."""
         started = perf_counter_ns()

@@ -104,7 +104,8 @@ class DecisionArrays:
         return int(self.kind.shape[0])
 
     def row(self, index: int) -> Decision:
-        """Return the decision about one robot, as NumPy arrays."""
+        """Return the decision about one robot, as NumPy arrays. A negative index counts from the end."""
+        index = range(len(self))[index]
         if index in self.singly:
             return self.singly[index]
         kind = KINDS[int(self.kind[index])]

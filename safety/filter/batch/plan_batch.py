@@ -156,7 +156,7 @@ class BackupPlanBatch:
     def _shares_used(self, states: Array) -> Array:
         """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
         with np.errstate(all="ignore"):
-            errors = self.predicted.errors(np, states, self.robot.heading)
+            errors = np.maximum(self.predicted.errors(np, states, self.robot.heading) - SAME_SET, 0.0)
             shares = np.where(errors == 0.0, 0.0, errors / self.predicted.half_width)
         return np.asarray(shares.max(axis=1))  # `_judge` takes NaN as infinite
 

@@ -88,7 +88,7 @@ class RequestArrays:
         action (B, m): proposals.
         input_in_force (B, m): inputs of the period before.
         plan (B, N, m): rests of the backup plans.
-        obstacles: at least those within `Filter.reach`.
+        obstacles: at least those within the robot's `sight` of the measured positions.
         known_free (B,): all space within reach is free, apart from the obstacles; bool.
         turn_aside: the filter turns blocked robots aside (`Request.turn_aside`), for each robot (B,), or for all.
         widening (B,): factor on every set of a plan, at least 1. None: 1 for all.
