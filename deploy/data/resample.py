@@ -81,9 +81,8 @@ def resample(
     positions, heading = states[: robot.position_dim], "" if robot.heading is None else states[robot.heading]
     places = resolve(tables, robot, options)
     chosen = choice_notes(tables, places)
-    pose = [*positions, *([heading] if heading else [])]
     places, glitches = without_glitches(places, positions, heading, inputs)
-    places, held = without_held_poses(places, pose, states)
+    places, held = without_held_poses(places, positions, heading, states)
     if robot.position_dim:
         refuse_contradictions(places, positions, inputs, heading, column_units(robot), options.units)
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)

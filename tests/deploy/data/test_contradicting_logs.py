@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.cli import main
+from brakeline.deploy.data.held_values import without_held_poses
+from brakeline.deploy.data.sources.source_table import Table
 from brakeline.sim.ground_estimator import wrap
 from tests.deploy.data.porter import COLUMNS, FILE, Porter, drive, driven_by, joystick, write_csv
 
@@ -190,18 +192,28 @@ def test_inputs_beyond_their_bounds_are_named_with_their_range(driven, tmp_path,
 # --- poses that are no measurements ---------------------------------------------------------------------------------
 
 
-def test_rows_that_repeat_a_pose_are_no_measurements(driven, tmp_path, capsys, figures):
+@pytest.mark.parametrize(("columns", "names"), [(slice(W + 1), "x, y, heading"), ([X, Y], "x, y")])
+def test_rows_that_repeat_a_pose_are_no_measurements(driven, tmp_path, capsys, figures, columns, names):
     """As many positions per period, and as large a chord deviation, as the log without these rows."""
     time, values = driven
     held = values.copy()
-    held[:, : W + 1] = values[np.arange(len(values)) // 5 * 5, : W + 1]
+    held[:, columns] = values[np.arange(len(values)) // 5 * 5][:, columns]
     path, out = write_csv(tmp_path / "held.csv", time, held), tmp_path / "a.safetensors"
     report = figures("import", path, "--robot", FILE, "--out", out)["report"]
-    assert any("x, y, heading change only in every 5th row" in note for note in report["notes"])
+    assert any(note.startswith(f"{names} change only in every 5th row") for note in report["notes"])
     sparse = write_csv(tmp_path / "sparse.csv", time[::5], values[::5])
     honest = figures("import", sparse, "--robot", FILE, "--out", out)["report"]
     assert report["samples"] == honest["samples"] == 2
     assert report["chord_deviation"] == pytest.approx(honest["chord_deviation"], rel=0.05)
+
+
+def test_repeated_states_in_joint_space_are_no_measurements(driven):
+    time, values = driven[0], driven[1].copy()
+    values[:, [X, Y]] = values[np.arange(len(values)) // 5 * 5][:, [X, Y]]
+    table = Table("", time, {"q1": values[:, X], "q2": values[:, Y]}, np.zeros(len(time), np.intp))
+    places, notes = without_held_poses({name: (table, name) for name in table.columns}, [], "", ["q1", "q2"])
+    assert [note[:38] for note in notes] == ["q1, q2 change only in every 5th row: t"]
+    assert all(np.isfinite(of.columns[name]).mean() == pytest.approx(0.2, abs=0.01) for of, name in places.values())
 
 
 def test_a_pose_that_is_lost_for_seconds_is_left_out(driven, tmp_path, capsys, figures):
