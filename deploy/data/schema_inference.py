@@ -198,7 +198,7 @@ def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Seque
     ramps = [(max(-c.least, c.most), c.change) for c in inputs if not (c.jumps or c.steers) and c.change > 0.0]
     falls = [(max(abs(c.least), abs(c.most)), c.change) for c in braking if c.change > 0.0]
     brake = max((math.ceil(round(min(ENDLESS, most / change), 6)) for most, change in (*ramps, *falls)), default=1)
-    return brake, math.ceil(max((c.delay or 0.0 for c in states), default=0.0) / period)
+    return brake, math.ceil(round(max((c.delay or 0.0 for c in states), default=0.0) / period, 3))
 
 
 def _states(log: AlignedLog, others: Sequence[str], pairs: dict[str, str]) -> list[InferredColumn]:

@@ -325,6 +325,17 @@ def test_the_delay_from_input_to_motion_is_found(late):
     assert max(shifted.report.delays.values()) <= 0.021
 
 
+def test_the_delay_is_the_same_whatever_the_clock():
+    """Stamps since 1970 are rounded to 0.2 µs, so an input seems to change a little after its row."""
+    time, values = drive(seconds=120.0, seed=3)
+    late = np.hstack([values[:-8, :5], values[8:, 5:]])
+    by_clock = []
+    for stamped in (0.0, 1764460000.0):
+        stamps = stamped + time[:-8:4]
+        by_clock.append(resample([table(stamps - stamps[0], late[::4])], porter(), LogOptions()).report.delays)
+    assert by_clock == [pytest.approx({"speed": 0.16, "turn rate": 0.16})] * 2
+
+
 def test_paths_between_samples_are_within_the_bound_that_is_said():
     """Seen once a period only, by a robot that changes its mind within one: the bulge holds what was not seen."""
     rng = np.random.default_rng(5)
