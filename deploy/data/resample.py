@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from brakeline.deploy.data.beat import find_beat
-from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free_recordings
+from brakeline.deploy.data.gap_free_recordings import GAP, GapFreeRecording, gap_free_recordings
 from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.held_values import without_held_poses
 from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
@@ -23,7 +23,7 @@ from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.motion_sense import refuse_contradictions
 from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
-from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
+from brakeline.deploy.data.sources.source_table import Array, Series, Table, notes_of
 from brakeline.deploy.data.standing_noise import small_errors
 from brakeline.errors import BadData, NoSource
 from brakeline.messaging.obstacle import rotate
@@ -90,7 +90,7 @@ def resample(
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
     responses = checked_responses(recordings, robot, delay)
-    step = float(np.median(np.concatenate([np.diff(r.states[0][0]) for r in recordings])))
+    step = max(_usual_step([r.states[i] for r in recordings]) for i in range(robot.path_dim))
     samples = int(np.clip(round(robot.period / step), 1, MAX_SAMPLES))
     resampled = [_trajectories(recording, robot, samples) for recording in recordings]
     pieces = [t for trajectories, _, _ in resampled for t in trajectories]
@@ -117,6 +117,18 @@ def resample(
     return ImportedData(
         data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, uneven, tuple(notes))
     )
+
+
+def _usual_step(parts: Sequence[Series]) -> float:
+    """Return the usual time in s between two samples of a coordinate.
+
+    It is the median, unless more than a tenth of the recorded time has far fewer samples. Rows in pairs and the rows
+    of a fast part are many, so they would decide about the median.
+    """
+    apart = np.sort(np.concatenate([np.diff(time) for time, _ in parts]))
+    lasted = np.cumsum(apart)
+    usual, slow = float(np.median(apart)), float(apart[np.searchsorted(lasted, MOSTLY * lasted[-1])])
+    return slow if slow > GAP * usual else usual
 
 
 def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list[Trajectory], Array, int]:

@@ -177,6 +177,30 @@ def test_a_recording_at_the_robots_period_is_taken_as_it_is():
     assert lengths(made) == [99], "the first period tells the input in force"
 
 
+@pytest.mark.parametrize(
+    ("rows", "runs", "samples"),
+    [
+        ([*range(0, 15_000, 5), *range(1, 15_000, 5)], 1, 2),  # in pairs, 0.02 and 0.08 s apart
+        ([*range(10_000), *range(10_000, 15_000, 10)], 2, 1),  # a fast run, and a slow one
+    ],
+)
+def test_the_positions_of_a_period_count_where_they_are_few(rows, runs, samples):
+    """Rows that are near each other say nothing about the path in the time without rows."""
+    time, values = drive(seconds=300.0, seed=4)
+    rows = np.sort(rows)
+    sparse = replace(table(time[rows], values[rows]), run=(rows >= 10_000).astype(np.intp) * (runs - 1))
+    assert resample([sparse], porter(), LogOptions()).report.samples == samples
+
+
+def test_the_positions_of_a_period_are_those_of_the_slowest_coordinate():
+    time, values = drive(seconds=120.0, seed=4)
+    whole = table(time, values)
+    seldom = whole.columns["y"].copy()
+    seldom[np.arange(len(time)) % 5 > 0] = np.nan
+    sparse = replace(whole, columns=whole.columns | {"y": seldom})
+    assert [resample([one], porter(), LogOptions()).report.samples for one in (whole, sparse)] == [10, 2]
+
+
 def test_a_state_between_two_samples_shows_nothing_of_the_input_that_follows_it():
     """Odometry every 40 ms, 20 ms beside the inputs, as two nodes that know nothing of each other publish them."""
     robot, rng = Porter(np.random.default_rng(0)), np.random.default_rng(1)
