@@ -82,6 +82,7 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
     options.check_names(list(wanted_units))
     places: Places = {}
     problems: list[str] = []
+    name_of: dict[tuple[str, str], str] = {}  # of each field that is used
     for name, unit in wanted_units.items():
         if name in options.fields:
             candidates = fields_named(tables, options.fields[name])
@@ -98,6 +99,11 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
             problems.append(
                 f"{name}: {', '.join(foreign)} is in no known unit; name it with --unit {name!r}=UNIT. Or convert the "
                 f"column to {unit or '1'}, and take it with --map {name!r}=COLUMN"
+            )
+        elif len(candidates) == 1 and (other := name_of.setdefault(_label(candidates[0]), name)) != name:
+            problems.append(
+                f"{name}: {other} is from {candidates[0][1]} too; name another field for one of them with "
+                f"--map {name!r}=TABLE/FIELD"
             )
         elif len(candidates) == 1:
             places[name] = _in_unit(candidates[0], name, options.units.get(name, ""), unit)
@@ -154,6 +160,10 @@ def with_values(place: Place, values: Array) -> Place:
 def _folded(name: str) -> str:
     """Return a name without case, spaces and signs."""
     return "".join(character for character in name.lower() if character.isalnum())
+
+
+def _label(place: Place) -> tuple[str, str]:
+    return place[0].name, place[1]
 
 
 def _in_unknown_units(candidates: Sequence[Place]) -> list[str]:

@@ -383,6 +383,8 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
     assert import_sources([path], porter(), LogOptions.parse(["y=why"])).report.periods > 250
     with pytest.raises(NoSource, match="one of x, y, heading, v, w, speed, turn rate"):
         import_sources([path], porter(), LogOptions.parse(["z=why"]))
+    with pytest.raises(NoSource, match=r"heading: y is from why too; name another field for one of them with --map"):
+        import_sources([path], porter(), LogOptions.parse(["y=why", "heading=why"]))
     slow = write_csv(tmp_path / "slow.csv", driven[0][::25], driven[1][::25])
     with pytest.raises(NoSource, match=r"a sample every 0.5 s: the robot's period of 0.2 s"):
         import_sources([slow], porter())
@@ -395,6 +397,16 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
 
 
 # --- what is said of it ------------------------------------------------------------------------------------------
+
+
+def test_one_field_of_a_message_is_not_two_inputs(driven):
+    """The turn rate of a Twist is not the speed of the left wheel, and of the right wheel."""
+    robot = replace(porter(), action=("left [rad/s]", "right [rad/s]"), follows=(-1, -1))
+    time, values = driven
+    names = ("position.x", "position.y", "yaw", "body.x", "yaw rate", "command.body.x", "command.yaw rate")
+    columns = dict(zip(names, values.T, strict=True))
+    with pytest.raises(NoSource, match=r"right: left is from command\.yaw rate too.*--map 'right'=TABLE/FIELD"):
+        resample([Table("/odom", time, columns, np.zeros(len(time), np.intp))], robot, LogOptions())
 
 
 def test_a_bag_without_stops_is_refused_with_what_to_drive(tmp_path, capsys):

@@ -180,6 +180,9 @@ def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
     path = write_csv(tmp_path / "drive.csv", *driven)
     for word, said in (("v=deg", "v is in m/s"), ("v=furlong", "UNIT is one of"), ("why=deg", "must be one of x, y")):
         assert said in refused(capsys, ["import", path, "--robot", FILE, "--unit", word])
+    twice = {"--unit": ["v=km/h", "v=mph"], "--map": ["v=w", "v=speed"]}
+    for option, words in twice.items():
+        assert f"{option} names 'v' twice" in refused(capsys, ["import", path, "--robot", FILE, option, *words])
 
 
 def test_a_unit_that_nobody_knows_is_refused_until_it_is_named(driven, tmp_path, capsys):
