@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
-from brakeline.deploy.data.unit_table import AS_IT_IS, in_si, unknown_unit
+from brakeline.deploy.data.unit_table import AS_IT_IS, factor, in_si, si_of, split_header, unknown_unit
 from brakeline.errors import NoSource
 from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Robot
@@ -106,7 +106,8 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
                 f"--map {name!r}=TABLE/FIELD"
             )
         elif len(candidates) == 1:
-            places[name] = _in_unit(candidates[0], name, options.units.get(name, ""), unit)
+            given = options.units.get(name, "")
+            places[name] = _in_unit(candidates[0], name, given, unit) if given else in_header_unit(candidates[0])[0]
         elif candidates:
             many = ", ".join(f"{t.name}/{f}" for t, f in candidates)
             problems.append(
@@ -155,6 +156,18 @@ def with_values(place: Place, values: Array) -> Place:
     """Return a place whose field has other values."""
     table, column = place
     return replace(table, columns=table.columns | {column: values}), column
+
+
+def in_header_unit(place: Place) -> tuple[Place, str]:
+    """Return a place in the unit of its header, converted to SI, and the SI unit; empty if the header names none.
+
+    `stamps.in_header_units` converts columns too, but not `NAME [UNIT]` beside a column NAME.
+    """
+    table, column = place
+    unit = "" if table.name else split_header(column)[1]
+    if not unit or si_of(unit) == "s":
+        return place, table.units.get(column, "")
+    return with_values(place, table.columns[column] * (factor(unit) or 1.0)), si_of(unit)
 
 
 def _folded(name: str) -> str:

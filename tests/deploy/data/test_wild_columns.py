@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -174,6 +175,18 @@ def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsy
 def test_the_unit_1_takes_a_column_as_it_is(driven, plain, tmp_path):
     path = write_csv(tmp_path / "drive.csv", *driven)
     same(plain, imported(path, "--unit", "heading=1", "v=1"), 1e-12)
+
+
+def test_a_header_names_the_unit_of_a_column_beside_one_of_the_same_name(driven, plain, tmp_path):
+    """`speed` in m/s and `speed [km/h]`: whoever maps the second one gets m/s, and need not give --unit."""
+    time, values = driven
+    more, names = np.column_stack([values, 3.6 * values[:, 5]]), (*COLUMNS, "speed [km/h]")
+    path, file = write_csv(tmp_path / "drive.csv", time, more, names), tmp_path / "new.toml"
+    for unit in ([], ["--unit", "speed=km/h"]):
+        same(imported(path, "--map", "speed=speed [km/h]", *unit), plain, 1e-8)
+    places = [f"{name}={name}" for name in ("x", "y", "heading", "v", "w")]
+    main(["robot", "new", str(file), "--from", str(path), "--map", *places, "command speed=speed [km/h]"])
+    assert tomllib.loads(file.read_text())["input"]["command speed"]["high"] == pytest.approx(0.6, abs=0.01)
 
 
 def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
