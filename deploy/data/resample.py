@@ -89,7 +89,7 @@ def resample(
     notes = [*notes_of(tables), *chosen, *glitches, *held, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
-    responses = checked_responses(recordings, robot, delay)
+    responses = checked_responses(recordings, robot, delay, options.units)
     step = max(_usual_step([r.states[i] for r in recordings]) for i in range(robot.path_dim))
     samples = int(np.clip(round(robot.period / step), 1, MAX_SAMPLES))
     resampled = [_trajectories(recording, robot, samples) for recording in recordings]

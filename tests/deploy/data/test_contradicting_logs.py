@@ -89,6 +89,38 @@ def test_a_column_that_contradicts_the_motion_is_refused(driven, tmp_path, capsy
     assert status == 1 and said in text and "Traceback" not in text
 
 
+@pytest.fixture
+def steered(driven):
+    """A car's log, as a robot whose measured steering follows its input, and its file."""
+    time, values = driven
+    held, steering = values[:, TURN] / 3.0, np.zeros(len(time))
+    for k in range(1, len(time)):
+        steering[k] = steering[k - 1] + 0.2 * (held[k - 1] - steering[k - 1])
+    return time, np.column_stack([values[:, :W], steering, values[:, SPEED], held])
+
+
+@pytest.mark.parametrize(
+    ("columns", "unit", "said"),
+    [
+        ([W], "", "angle looks like deg: it is 5"),
+        ([TURN], "", "steering looks like deg: it is "),
+        ([], "angle=deg", "angle is in rad already: only without --unit angle=deg"),
+        ([W], "angle=deg", ""),
+        ([W], "angle=1", ""),
+    ],
+)
+def test_a_measured_angle_is_in_the_unit_of_the_input_that_it_follows(steered, tmp_path, capsys, columns, unit, said):
+    """Degrees beside rad: neither the motion nor the correlation of both would show them."""
+    time, values = steered[0], steered[1].copy()
+    values[:, columns] = np.degrees(values[:, columns])
+    text = FILE.read_text().replace('w = { unit = "rad/s"', 'angle = { unit = "rad"').replace("turn rate", "steering")
+    robot = tmp_path / "porter.toml"
+    robot.write_text(text.replace('"steering" = { unit = "rad/s"', '"steering" = { unit = "rad"'))
+    path = write_csv(tmp_path / "drive.csv", time, values, ("x", "y", "heading", "v", "angle", "speed", "steering"))
+    status, text = imported(path, capsys, *(["--unit", unit] if unit else []), robot=robot)
+    assert (status == 0, said in text) == (not said, True), text
+
+
 def test_late_inputs_are_imported_with_the_delay_that_the_error_names(driven, tmp_path, capsys):
     time, values = driven[0], driven[1].copy()
     late(values, [SPEED, TURN], PERIOD)
