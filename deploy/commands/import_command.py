@@ -52,9 +52,10 @@ class ImportCommand:
         from brakeline.deploy.data.coverage import coverage, draw_coverage
         from brakeline.deploy.data.data_paths import record_path
         from brakeline.messaging.robot import robot_named
+        from brakeline.safety.model.dataset import Dataset
 
-        if self.out is not None and self.out.is_dir():
-            raise ValueError(f"--out {self.out} is a folder: give the path of a file, such as data.safetensors")
+        if self.out is not None:
+            Dataset.check_out(self.out)
         robot = robot_named(self.robot)
         options = self.reading.options(self.map)
         imported = importer.import_sources(self.sources, robot, options, self.delay, self.hold)

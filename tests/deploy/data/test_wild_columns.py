@@ -172,6 +172,17 @@ def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsy
     assert f"already: only without --unit {word} does the motion agree" in text and not mine.exists()
 
 
+@pytest.mark.parametrize("command", ["import", "collect"])
+def test_a_file_that_is_no_data_set_is_not_written_over(driven, tmp_path, capsys, command):
+    """Least of all the log itself. A data set may be written again."""
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    imported(path)
+    before, words = path.read_text(), ["import", path, "--robot", FILE] if command == "import" else ["collect"]
+    assert "exists, and is no data set: choose another file" in refused(capsys, [*words, "--out", path])
+    assert path.read_text() == before
+    imported(path)
+
+
 def test_the_unit_1_takes_a_column_as_it_is(driven, plain, tmp_path):
     path = write_csv(tmp_path / "drive.csv", *driven)
     same(plain, imported(path, "--unit", "heading=1", "v=1"), 1e-12)
