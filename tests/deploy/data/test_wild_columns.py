@@ -172,6 +172,16 @@ def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsy
     assert f"already: only without --unit {word} does the motion agree" in text and not mine.exists()
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16"])
+def test_a_degree_sign_is_one_in_any_encoding(driven, plain, tmp_path, encoding):
+    time, values = driven[0], driven[1].copy()
+    values[:, 2], values[:, 4] = np.degrees(values[:, 2]), np.degrees(values[:, 4])
+    names = [{"heading": "heading (°)", "w": "w [°/s]"}.get(name, name) for name in COLUMNS]
+    path = write_csv(tmp_path / "drive.csv", time, values, names)
+    path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
+    same(imported(path), plain, 1e-8)
+
+
 @pytest.mark.parametrize("command", ["import", "collect"])
 def test_a_file_that_is_no_data_set_is_not_written_over(driven, tmp_path, capsys, command):
     """Least of all the log itself. A data set may be written again."""
