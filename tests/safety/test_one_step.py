@@ -260,6 +260,12 @@ def test_too_little_driving_and_stops_by_feedback_are_refused():
     few = Trajectory(whole.states[:21], whole.inputs[:20], whole.paths[:20], whole.turned[:20])
     with pytest.raises(BadData, match="record at least"):
         fit_one_step(Dataset(ROBOT, (few,)), CONFIG)
+    short = [
+        Trajectory(whole.states[i : i + 3], whole.inputs[i : i + 2], whole.paths[i : i + 2], whole.turned[i : i + 2])
+        for i in range(0, 300, 3)
+    ]
+    with pytest.raises(BadData, match=r"no recording without a gap is as long as a plan .* the longest has 2 periods"):
+        fit_one_step(Dataset(ROBOT, tuple(short)), CONFIG)
     with pytest.raises(ErrorBoundError, match="feedback"):
         fit_one_step(Dataset(puck("puck"), (whole,)), CONFIG)
 
