@@ -172,6 +172,17 @@ def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsy
     assert f"already: only without --unit {word} does the motion agree" in text and not mine.exists()
 
 
+@pytest.mark.parametrize("stamp", ["", "nan", "inf", "-inf"])
+def test_a_row_without_a_stamp_is_left_out(driven, plain, tmp_path, stamp):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    header, *rows = path.read_text().splitlines()
+    rows[503] = stamp + rows[503][rows[503].index(",") :]  # within a period, and one of ten rows
+    path.write_text("\n".join([header, *rows]) + "\n")
+    data = imported(path)
+    assert data.periods == plain.periods
+    assert np.allclose(data.trajectories[1].states, plain.trajectories[1].states)
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16"])
 def test_a_degree_sign_is_one_in_any_encoding(driven, plain, tmp_path, encoding):
     time, values = driven[0], driven[1].copy()
