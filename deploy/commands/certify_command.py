@@ -71,6 +71,7 @@ class CertifyCommand:
     json: options.Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "logs")
+    least: ClassVar[dict[str, float]] = {"last": 1}
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""

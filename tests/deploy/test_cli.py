@@ -377,6 +377,7 @@ def test_show_prints_a_description(command, figures, robot):
         ("demo --seed -1", "--seed is a number from 0 on, not -1"),
         ("pretrain secas --seed -1", "--seed is a number from 0 on, not -1"),
         ("excite --minutes 0", "--minutes is a number above 0, not 0"),
+        ("certify --last 0", "--last is a number from 1 on, not 0"),
         ("import a.csv --hold 0", "--hold is a number above 0, not 0"),
         ("import a.csv --delay nan", "--delay is a number from -1e+09 to 1e+09, not nan"),
         ("import a.csv --out .", "--out . is a folder: give the path of a file"),
