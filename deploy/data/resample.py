@@ -20,7 +20,7 @@ from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.held_values import without_held_poses
 from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
 from brakeline.deploy.data.log_options import LogOptions
-from brakeline.deploy.data.motion_sense import refuse_contradictions
+from brakeline.deploy.data.motion_sense import motion_notes
 from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
 from brakeline.deploy.data.sources.source_table import Array, Series, Table, notes_of
@@ -83,10 +83,10 @@ def resample(
     chosen = choice_notes(tables, places)
     places, glitches = without_glitches(places, positions, heading, inputs)
     places, held = without_held_poses(places, positions, heading, states)
-    if robot.position_dim:
-        refuse_contradictions(places, positions, inputs, heading, column_units(robot), options.units)
+    units = column_units(robot)
+    seen = motion_notes(places, positions, inputs, heading, units, options.units) if robot.position_dim else []
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)
-    notes = [*notes_of(tables), *chosen, *glitches, *held, *cuts]
+    notes = [*notes_of(tables), *chosen, *glitches, *held, *seen, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
     responses = checked_responses(recordings, robot, delay, options.units)

@@ -89,6 +89,17 @@ def test_a_column_that_contradicts_the_motion_is_refused(driven, tmp_path, capsy
     assert status == 1 and said in text and "Traceback" not in text
 
 
+def test_a_position_of_something_else_is_noted(driven, tmp_path, capsys):
+    """Its motion has no relation to the speed, so no unit, sign or swap explains it."""
+    time, values = driven[0], driven[1].copy()
+    status, text = imported(write_csv(tmp_path / "right.csv", time, values), capsys)
+    assert status == 0 and "agrees little" not in text
+    values[:, X] = 0.5 * np.sin(0.7 * time)
+    status, text = imported(write_csv(tmp_path / "wrong.csv", time, values), capsys)
+    assert status == 0 and "v agrees little with the motion of x, y, heading (correlation 0." in text
+    assert "agrees little" not in imported(tmp_path / "wrong.csv", capsys, "--unit", "v=1")[1]
+
+
 @pytest.fixture
 def steered(driven):
     """A car's log, as a robot whose measured steering follows its input, and its file."""
