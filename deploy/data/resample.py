@@ -16,6 +16,7 @@ import numpy as np
 
 from brakeline.deploy.data.beat import find_beat
 from brakeline.deploy.data.gap_free_recordings import GAP, GapFreeRecording, gap_free_recordings
+from brakeline.deploy.data.glitches import MOST as MOST_GLITCHES
 from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.held_values import without_held_poses
 from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
@@ -25,6 +26,7 @@ from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
 from brakeline.deploy.data.sources.source_table import Array, Series, Table, notes_of
 from brakeline.deploy.data.standing_noise import small_errors
+from brakeline.deploy.data.unit_table import AS_IT_IS, unit_option
 from brakeline.errors import BadData, NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
@@ -35,6 +37,7 @@ MOSTLY = 0.9  # share of a period: an input held for longer is the period's inpu
 FEWEST_PERIODS = 5  # shorter trajectories are dropped
 LONGEST, FEWEST_PARTS = 300, 60  # periods per trajectory; number of trajectories, so that 30 % can be held out
 MAX_SAMPLES = 20  # positions per period
+FAR = 10.0  # times an input's larger bound
 SAME = 1e-6  # s: closer times are the same, but for rounding
 LIKE_A_BEAT = 0.9  # share of the times between changes that are multiples of a beat
 NEAR_MULTIPLE = 0.05  # of a beat: how far from a multiple of it the period counts as one
@@ -90,6 +93,7 @@ def resample(
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
     responses = checked_responses(recordings, robot, delay, options.units)
+    _refuse_far_inputs(recordings, robot, options)
     step = max(_usual_step([r.states[i] for r in recordings]) for i in range(robot.path_dim))
     samples = int(np.clip(round(robot.period / step), 1, MAX_SAMPLES))
     resampled = [_trajectories(recording, robot, samples) for recording in recordings]
@@ -251,7 +255,22 @@ def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) ->
     return worst / 4.0 / samples**2
 
 
-def _beyond(recordings: list[GapFreeRecording], robot: Robot) -> str:
+def _refuse_far_inputs(recordings: Sequence[GapFreeRecording], robot: Robot, options: LogOptions) -> None:
+    """Raise NoSource if an input often is so far beyond its bounds that it must be in another unit, such as percent.
+
+    Its smallest values are within the bounds. They would be taken for large ones.
+    """
+    for i, name in enumerate(column_names(robot)[1]):
+        values = np.concatenate([r.inputs[i][1] for r in recordings])
+        most = max(abs(float(robot.low()[i])), abs(float(robot.high()[i])))
+        if np.quantile(np.abs(values), 1.0 - MOST_GLITCHES) > FAR * most and options.units.get(name) != AS_IT_IS:
+            raise NoSource(
+                f"{_beyond(recordings, robot)}: {name} is in another unit than the description's. Convert it (--unit), "
+                f"correct the bounds, or take the column as it is with {unit_option(name, AS_IT_IS)}"
+            )
+
+
+def _beyond(recordings: Sequence[GapFreeRecording], robot: Robot) -> str:
     """Return the ranges of the inputs that leave their bounds, with the bounds."""
     ranges = []
     for i, name in enumerate(column_names(robot)[1]):

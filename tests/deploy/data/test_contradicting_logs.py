@@ -232,6 +232,23 @@ def test_inputs_beyond_their_bounds_are_named_with_their_range(driven, tmp_path,
     assert "windows of a plan's length (5 periods; they overlap)" in text
 
 
+def test_an_input_far_beyond_its_bounds_is_in_another_unit(driven, tmp_path, capsys):
+    """In percent, only values below 1 % are within bounds of 1: the robot would seem to stand at full speed."""
+    time, values = driven[0], driven[1].copy()
+    robot, text = tmp_path / "porter.toml", FILE.read_text()
+    text = text.replace(', follows = "speed"', "").replace('speed = { unit = "m/s"', 'speed = { unit = "1"')
+    text = text.replace("high = 0.6", "high = 1.0")
+    robot.write_text(text)
+    values[:, SPEED] *= 100.0 / 0.6
+    path = write_csv(tmp_path / "drive.csv", time, values)
+    status, text = imported(path, capsys, robot=robot)
+    assert status == 1 and "speed 0 to 100, bounds 0 to 1: speed is in another unit" in text
+    status, text = imported(path, capsys, "--unit", "speed=1", robot=robot)
+    assert "an input was outside the robot's bounds (speed 0 to 100, bounds 0 to 1)" in text
+    values[:, SPEED] /= 100.0
+    assert imported(write_csv(path, time, values), capsys, robot=robot)[0] == 0
+
+
 # --- poses that are no measurements ---------------------------------------------------------------------------------
 
 
