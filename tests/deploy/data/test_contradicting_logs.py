@@ -267,6 +267,15 @@ def test_rows_that_repeat_a_pose_are_no_measurements(driven, tmp_path, capsys, f
     assert report["chord_deviation"] == pytest.approx(honest["chord_deviation"], rel=0.05)
 
 
+def test_whole_centimetres_of_a_slow_robot_are_measurements(driven, tmp_path, figures):
+    time, values = driven[0], driven[1].copy()
+    values[:, [V, SPEED]] *= 0.2
+    values[:, [X, Y]] = np.round(0.2 * values[:, [X, Y]], 2)
+    path, out = write_csv(tmp_path / "slow.csv", time, values), tmp_path / "a.safetensors"
+    report = figures("import", path, "--robot", FILE, "--out", out)["report"]
+    assert report["samples"] == 10 and not any("repeat" in note for note in report["notes"])
+
+
 def test_repeated_states_in_joint_space_are_no_measurements(driven):
     time, values = driven[0], driven[1].copy()
     values[:, [X, Y]] = values[np.arange(len(values)) // 5 * 5][:, [X, Y]]
