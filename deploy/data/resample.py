@@ -84,7 +84,8 @@ def resample(
     positions, heading = states[: robot.position_dim], "" if robot.heading is None else states[robot.heading]
     places = resolve(tables, robot, options)
     chosen = choice_notes(tables, places)
-    places, glitches = without_glitches(places, positions, heading, inputs)
+    bounds = dict(zip(inputs, zip(robot.action_low, robot.action_high, strict=True), strict=True))
+    places, glitches = without_glitches(places, positions, heading, bounds)
     places, held = without_held_poses(places, positions, heading, states)
     units = column_units(robot)
     seen = motion_notes(places, positions, inputs, heading, units, options.units) if robot.position_dim else []

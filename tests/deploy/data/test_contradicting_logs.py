@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.cli import main
+from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.held_values import without_held_poses
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.sim.ground_estimator import wrap
@@ -247,6 +248,18 @@ def test_an_input_far_beyond_its_bounds_is_in_another_unit(driven, tmp_path, cap
     assert "an input was outside the robot's bounds (speed 0 to 100, bounds 0 to 1)" in text
     values[:, SPEED] /= 100.0
     assert imported(write_csv(path, time, values), capsys, robot=robot)[0] == 0
+
+
+def test_a_rare_input_within_its_bounds_is_not_said_to_be_cut():
+    values = np.linspace(0.0, 0.1, 500)
+    values[[100, 300]] = 0.9, 9.0
+    table = Table("", np.arange(500.0), {"speed": values}, np.zeros(500, np.intp))
+    places, notes = without_glitches({"speed": (table, "speed")}, [], "", {"speed": (0.0, 1.0)})
+    assert places["speed"][0] is table, "both stay"
+    assert [note.partition(": ")[2].split(": ")[-1] for note in notes] == [
+        "the recording is cut there",
+        "it counts, as it is within the bounds of the input",
+    ]
 
 
 # --- poses that are no measurements ---------------------------------------------------------------------------------
