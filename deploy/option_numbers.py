@@ -15,7 +15,7 @@ MOST = 1e9  # of every number but seeds, and -MOST the least: 30 years in second
 def check_option_numbers(command: Any) -> None:
     """Check a command's numbers: seeds from 0 on, and those for which it states `least` or `above`, without NaN.
 
-    No other number may be larger than `MOST`.
+    No other number may be larger than `MOST`, or NaN.
 
     Raises:
         ValueError: a number makes no sense.
@@ -29,7 +29,7 @@ def check_option_numbers(command: Any) -> None:
         if value is not None and not above < value < math.inf:
             raise ValueError(f"{_option(name)} is a number above {above:g}, not {value:g}")
     for name, value in _numbers(command):
-        if abs(value) > MOST:
+        if not abs(value) <= MOST:  # NaN too
             raise ValueError(f"{_option(name)} is a number from {-MOST:g} to {MOST:g}, not {value:g}")
 
 

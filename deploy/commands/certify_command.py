@@ -71,6 +71,7 @@ class CertifyCommand:
     json: options.Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "logs")
+    least: ClassVar[dict[str, float]] = {"last": 1}
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
@@ -182,7 +183,7 @@ class CertifyCommand:
     def _load(self) -> tuple[Path, Dataset, str]:
         """Return the source, its data and a note. Raises ValueError if a named data set does not exist."""
         from brakeline.deploy.data.run_dataset import from_log
-        from brakeline.deploy.data.simulated_recording import data_for
+        from brakeline.deploy.data.simulated_recording import data_for, described_today
         from brakeline.safety.model.dataset import Dataset
 
         if self.robot.endswith(DATA) or Path(self.robot).is_dir():
@@ -194,9 +195,8 @@ class CertifyCommand:
             if not self.data.exists():  # a mistyped name must not start a recording
                 raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
             path, data = self.data, Dataset.load(self.data)
-            if robot.kind == data.robot.kind:  # today's description sets the limit, not the one that was recorded
-                recorded = data.robot.in_lockstep().in_real_time() if robot.late else data.robot
-                data = replace(data, robot=replace(recorded, accept_bound=robot.accept_bound))
+            if robot.kind == data.robot.kind:
+                data = described_today(data, robot, path)
         else:
             return self.data, *from_log(self.data, robot, self.last)
         return path, data, f"{data.periods} recorded periods of {data.robot.name}"

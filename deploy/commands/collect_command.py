@@ -63,8 +63,10 @@ class CollectCommand:
         """Raise ValueError for a value that makes no sense, and for options that do nothing with or without --url."""
         if self.seed < 0 or (self.trajectories is not None and self.trajectories < 1):
             raise ValueError("--seed is a number from 0 on, and --trajectories a number from 1 on")
-        if self.out is not None and self.out.is_dir():
-            raise ValueError(f"--out {self.out} is a folder: give the path of a file, such as data.safetensors")
+        if self.out is not None:
+            from brakeline.safety.model.dataset import Dataset
+
+            Dataset.check_out(self.out)
         if self.url and (self.trajectories is not None or self.physics != options.PhysicsOptions()):
             raise ValueError("--url ignores --trajectories and what changes the simulator: leave these options out")
         age = self.first_flight.acceleration_age

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 from rich.markup import escape
@@ -43,6 +43,8 @@ class ImportCommand:
     quiet: Quiet = False
     json: Json = False
 
+    above: ClassVar[dict[str, float]] = {"hold": 0.0}
+
     def run(self) -> int:
         """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
         from brakeline.deploy.data import importer
@@ -50,7 +52,10 @@ class ImportCommand:
         from brakeline.deploy.data.coverage import coverage, draw_coverage
         from brakeline.deploy.data.data_paths import record_path
         from brakeline.messaging.robot import robot_named
+        from brakeline.safety.model.dataset import Dataset
 
+        if self.out is not None:
+            Dataset.check_out(self.out)
         robot = robot_named(self.robot)
         options = self.reading.options(self.map)
         imported = importer.import_sources(self.sources, robot, options, self.delay, self.hold)

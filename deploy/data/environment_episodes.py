@@ -153,7 +153,7 @@ class _Environment:
                 seen = displacement(self.robot, built.state, state)
                 turned = 0.0 if self.robot.heading is None else float(seen[self.robot.heading])
                 moved = seen[: self.robot.position_dim] if self.robot.position_dim else state - built.state
-                path = np.asarray(info.get("subsamples", moved[None]), dtype=float)
+                path = np.array(info.get("subsamples", moved[None]), dtype=float)  # a copy
                 built.add(executed, state, path, float(info.get("turned", turned)))
             if truncated:
                 break

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +24,20 @@ NAMED = 5  # glitches that notes name
 
 
 def without_glitches(
-    places: Places, positions: Sequence[str], heading: str, inputs: Sequence[str] = ()
+    places: Places,
+    positions: Sequence[str],
+    heading: str,
+    inputs: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> tuple[Places, list[str]]:
     """Return the places with glitches as missing values, and notes that name them.
 
-    Glitches of `inputs` are named, but they stay: the robot may have followed them, and they are beyond its bounds.
+    Glitches of `inputs` are named, but they stay: the robot may have followed them. Most are beyond its bounds.
 
     Args:
         places: table and field of each column.
         positions: they have no usual range: a glitch jumps away and back.
         heading: the column of the heading in rad; as positions, but modulo 2 pi.
-        inputs: columns of inputs; the recording is cut at their glitches.
+        inputs: bounds of the columns of inputs; the recording is cut at glitches that are beyond them.
     """
     clean, notes = dict(places), list[str]()
     for name, (table, column) in places.items():
@@ -44,8 +48,12 @@ def without_glitches(
             rows = _spikes(values) if name in positions else _outliers(values)
         if not len(rows):
             continue
-        notes += _named(table, column, rows, "the recording is cut there" if name in inputs else "left out")
-        if name not in inputs:
+        if name in inputs:
+            beyond = (values[rows] < inputs[name][0]) | (values[rows] > inputs[name][1])
+            notes += _named(table, column, rows[beyond], "the recording is cut there")
+            notes += _named(table, column, rows[~beyond], "it counts, as it is within the bounds of the input")
+        else:
+            notes += _named(table, column, rows, "left out")
             known = values.copy()
             known[rows] = np.nan
             clean[name] = with_values((table, column), known)

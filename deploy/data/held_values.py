@@ -20,21 +20,41 @@ from brakeline.deploy.data.sources.source_table import Array
 Flags = NDArray[np.bool_]
 
 LOST = 5  # times the usual rows with one pose: if it then jumps, the pose was lost
+REGULAR = 0.9  # share of the changes of a position that are the usual number of rows apart, or one more or less
 ALSO_HELD = 0.95  # share of a column's changes that are in rows with a new pose: it is written with the pose
 
 
-def without_held_poses(places: Places, pose: Sequence[str], states: Sequence[str]) -> tuple[Places, list[str]]:
+def without_held_poses(
+    places: Places, positions: Sequence[str], heading: str, states: Sequence[str]
+) -> tuple[Places, list[str]]:
     """Return the places with repeated poses as missing values, and notes on them.
 
     A robot that stands may repeat its pose too. So every n-th row counts as a measurement, if the pose usually changes
-    every n-th row.
+    every n-th row. A position may be repeated beside a heading of another sensor.
 
     Args:
         places: table and field of each column.
-        pose: columns of the position, and the heading if there is one. They are compared if they share a table.
-        states: columns of the other coordinates; those that are written with the pose are left out with it.
+        positions: columns of the position. Without any, all states count as the pose.
+        heading: column of the heading; empty for none.
+        states: columns of all coordinates; those that are written with the pose are left out with it.
     """
-    if not pose or any(places[name][0].time is not places[pose[0]][0].time for name in pose):
+    pose = [*positions, *([heading] if heading else [])]
+    if not pose:
+        return _without_held(places, states, states, REGULAR)
+    places, notes = _without_held(places, pose, states, 0.0)
+    places, more = _without_held(places, positions, states, REGULAR) if heading else (places, [])
+    return places, notes + more
+
+
+def _without_held(
+    places: Places, pose: Sequence[str], states: Sequence[str], regular: float
+) -> tuple[Places, list[str]]:
+    """Return the places with repeated values of the columns `pose`, if these share a table, as missing values.
+
+    regular: share of the changes that must be n rows apart. A slow robot repeats its position in whole centimetres too,
+    but for another number of rows each time.
+    """
+    if any(places[name][0].time is not places[pose[0]][0].time for name in pose):
         return places, []
     table = places[pose[0]][0]
     rows = np.flatnonzero(np.isfinite([places[name][0].columns[places[name][1]] for name in pose]).all(0))
@@ -50,6 +70,8 @@ def without_held_poses(places: Places, pose: Sequence[str], states: Sequence[str
     new: Flags = np.asarray((moved > 0.0).any(1) | begins)
     at = np.flatnonzero(new)
     every = int(np.median(np.diff(at))) if len(at) > FEWEST_ROWS else 1
+    if every > 1 and np.mean(np.abs(np.diff(at) - every) <= 1) < regular:
+        every = 1
     lost = np.zeros(len(rows), bool)
     notes = []
     for i, j in _lost(moved, begins, at, every):

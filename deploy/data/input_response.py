@@ -16,6 +16,7 @@ from brakeline.messaging.robot import Robot
 FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
 STEPS_PER_PERIOD = 10  # resolution of the delay, if the source is sampled that often
 MAX_DELAY = 3.0  # periods
+NEAR = 0.1  # of a time step: closer times are the same, but for rounded stamps
 
 
 def followers_of_inputs(log: AlignedLog, others: Sequence[str]) -> dict[str, str]:
@@ -100,7 +101,10 @@ def response_by_lag(recordings: Sequence[tuple[Series, Series, float, float]], p
     The lags are -n, ..., n time steps, of which n are `MAX_DELAY` periods or `MAX_LAG`. At a negative lag, the follower
     changes before its input. If the input or the follower never changes, all correlations are 0.
     """
-    sampled = float(np.median(np.concatenate([np.diff(follower[0]) for _, follower, _, _ in recordings])))
+    apart = np.concatenate([np.diff(follower[0]) for _, follower, _, _ in recordings])
+    usual = float(np.quantile(apart, 0.5, method="lower"))
+    # The mean, because rounded stamps differ by more than the median shows: its multiples would drift off the samples.
+    sampled = float(apart[np.abs(apart - usual) <= NEAR * usual].mean())
     step = max(sampled, period / STEPS_PER_PERIOD)
     most = math.ceil(max(MAX_DELAY * period, MAX_LAG) / step)
     lags = range(-most, most + 1)
@@ -109,7 +113,7 @@ def response_by_lag(recordings: Sequence[tuple[Series, Series, float, float]], p
         times = np.arange(begin, end, step)
         if len(times) <= most + 2:
             continue
-        changed = np.diff(hold_at(inputs, times + 1e-6 * step))
+        changed = np.diff(hold_at(inputs, times + NEAR * step))
         moved = np.diff(np.interp(times, follower_time, follower))
         # A change at t[i] shows in the step after t[i].
         changed, moved = changed[:-1], moved[1:]

@@ -40,7 +40,8 @@ class LogOptions:
             name, _, place = word.partition("=")
             if not (name and place):
                 raise NoSource(f"--map {word!r} must be NAME=TABLE/FIELD, or NAME=COLUMN for a file of columns")
-            fields[name] = place
+            if fields.setdefault(name, place) != place:
+                raise NoSource(f"--map names {name!r} twice: {fields[name]} and {place}")
         return cls(fields, chosen_units(units), tuple(topics), limits)
 
     def check_names(self, names: Sequence[str]) -> None:

@@ -31,22 +31,28 @@ COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the
 UNRELATED = 0.5  # largest correlation with a column's own quantity, if the column holds another one
 FAR_GAIN = {False: 2.0, True: 5.0}  # of a state, of an input: farther from 1 it is another unit
 BACKWARDS = 0.3  # of the usual top speed: a robot that moves so fast against its heading drives backwards
+CONFIRMED = 0.8  # least correlation of a speed with the motion, if its column and those of the pose are right
+MOVED = {"m/s": 0.2, "rad/s": 0.5}  # range of a speed that the motion must show
 QUANTITIES = {"m/s": "speed", "rad/s": "turn rate"}
 
 
-def refuse_contradictions(
+def motion_notes(
     places: Places,
     positions: list[str],
     inputs: list[str],
     heading: str,
     units: Mapping[str, str],
     given: Mapping[str, str],
-) -> None:
-    """Raise NoSource with what to do if the motion contradicts a column."""
+) -> list[str]:
+    """Return notes on speeds that the motion does not confirm.
+
+    Raises:
+        NoSource: the motion contradicts a column; the message says what to do.
+    """
     try:
         log = align(places, positions, inputs, {})
     except NoSource:
-        return  # too few rows to compare; `resample` says so
+        return []  # too few rows to compare; `resample` says so
     if positions and not any(np.ptp(log.columns[name]) for name in positions):
         raise NoSource(
             f"{', '.join(positions)} never change: they do not hold the robot's position. Name the right columns with "
@@ -55,6 +61,24 @@ def refuse_contradictions(
     problems = contradictions(log, heading, units, given) or wrong_senses(log, heading, units, given)
     if problems:
         raise NoSource("\n".join(problems))
+    return _unconfirmed(log, heading, units, given)
+
+
+def _unconfirmed(log: AlignedLog, heading: str, units: Mapping[str, str], given: Mapping[str, str]) -> list[str]:
+    """Return notes on measured speeds that agree little with the motion, and on the turn rate if there is only one."""
+    speeds, notes = speeds_of_motion(log, heading), []
+    measured = {name: unit for name, unit in units.items() if name not in log.inputs}
+    several = list(measured.values()).count("rad/s") > 1  # of wheels or joints
+    for name, unit in measured.items():
+        if unit in QUANTITIES and given.get(name) != AS_IT_IS and not (several and unit == "rad/s"):
+            fit = best_fit(log, name, [s for s in speeds if s[0] == unit], False)
+            if fit.gain and fit.correlation < CONFIRMED and np.ptp(span_means(log, name)) > MOVED[unit]:
+                pose = ", ".join((*log.positions, heading) if heading else log.positions)
+                notes.append(
+                    f"{name} agrees little with the motion of {pose} (correlation {max(fit.correlation, 0.0):.2f}): "
+                    "unless the robot slips that much, one of these columns is of something else"
+                )
+    return notes
 
 
 def wrong_senses(log: AlignedLog, heading: str, units: Mapping[str, str], given: Mapping[str, str]) -> list[str]:

@@ -15,16 +15,18 @@ from itertools import pairwise
 import numpy as np
 
 from brakeline.deploy.data.beat import find_beat
-from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free_recordings
+from brakeline.deploy.data.gap_free_recordings import GAP, GapFreeRecording, gap_free_recordings
+from brakeline.deploy.data.glitches import MOST as MOST_GLITCHES
 from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.held_values import without_held_poses
 from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
 from brakeline.deploy.data.log_options import LogOptions
-from brakeline.deploy.data.motion_sense import refuse_contradictions
+from brakeline.deploy.data.motion_sense import motion_notes
 from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
-from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
+from brakeline.deploy.data.sources.source_table import Array, Series, Table, notes_of
 from brakeline.deploy.data.standing_noise import small_errors
+from brakeline.deploy.data.unit_table import AS_IT_IS, unit_option
 from brakeline.errors import BadData, NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
@@ -35,6 +37,7 @@ MOSTLY = 0.9  # share of a period: an input held for longer is the period's inpu
 FEWEST_PERIODS = 5  # shorter trajectories are dropped
 LONGEST, FEWEST_PARTS = 300, 60  # periods per trajectory; number of trajectories, so that 30 % can be held out
 MAX_SAMPLES = 20  # positions per period
+FAR = 10.0  # times an input's larger bound
 SAME = 1e-6  # s: closer times are the same, but for rounding
 LIKE_A_BEAT = 0.9  # share of the times between changes that are multiples of a beat
 NEAR_MULTIPLE = 0.05  # of a beat: how far from a multiple of it the period counts as one
@@ -81,17 +84,18 @@ def resample(
     positions, heading = states[: robot.position_dim], "" if robot.heading is None else states[robot.heading]
     places = resolve(tables, robot, options)
     chosen = choice_notes(tables, places)
-    pose = [*positions, *([heading] if heading else [])]
-    places, glitches = without_glitches(places, positions, heading, inputs)
-    places, held = without_held_poses(places, pose, states)
-    if robot.position_dim:
-        refuse_contradictions(places, positions, inputs, heading, column_units(robot), options.units)
+    bounds = dict(zip(inputs, zip(robot.action_low, robot.action_high, strict=True), strict=True))
+    places, glitches = without_glitches(places, positions, heading, bounds)
+    places, held = without_held_poses(places, positions, heading, states)
+    units = column_units(robot)
+    seen = motion_notes(places, positions, inputs, heading, units, options.units) if robot.position_dim else []
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)
-    notes = [*notes_of(tables), *chosen, *glitches, *held, *cuts]
+    notes = [*notes_of(tables), *chosen, *glitches, *held, *seen, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
-    responses = checked_responses(recordings, robot, delay)
-    step = float(np.median(np.concatenate([np.diff(r.states[0][0]) for r in recordings])))
+    responses = checked_responses(recordings, robot, delay, options.units)
+    _refuse_far_inputs(recordings, robot, options)
+    step = max(_usual_step([r.states[i] for r in recordings]) for i in range(robot.path_dim))
     samples = int(np.clip(round(robot.period / step), 1, MAX_SAMPLES))
     resampled = [_trajectories(recording, robot, samples) for recording in recordings]
     pieces = [t for trajectories, _, _ in resampled for t in trajectories]
@@ -118,6 +122,18 @@ def resample(
     return ImportedData(
         data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, uneven, tuple(notes))
     )
+
+
+def _usual_step(parts: Sequence[Series]) -> float:
+    """Return the usual time in s between two samples of a coordinate.
+
+    It is the median, unless more than a tenth of the recorded time has far fewer samples. Rows in pairs and the rows
+    of a fast part are many, so they would decide about the median.
+    """
+    apart = np.sort(np.concatenate([np.diff(time) for time, _ in parts]))
+    lasted = np.cumsum(apart)
+    usual, slow = float(np.median(apart)), float(apart[np.searchsorted(lasted, MOSTLY * lasted[-1])])
+    return slow if slow > GAP * usual else usual
 
 
 def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list[Trajectory], Array, int]:
@@ -240,7 +256,22 @@ def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) ->
     return worst / 4.0 / samples**2
 
 
-def _beyond(recordings: list[GapFreeRecording], robot: Robot) -> str:
+def _refuse_far_inputs(recordings: Sequence[GapFreeRecording], robot: Robot, options: LogOptions) -> None:
+    """Raise NoSource if an input often is so far beyond its bounds that it must be in another unit, such as percent.
+
+    Its smallest values are within the bounds. They would be taken for large ones.
+    """
+    for i, name in enumerate(column_names(robot)[1]):
+        values = np.concatenate([r.inputs[i][1] for r in recordings])
+        most = max(abs(float(robot.low()[i])), abs(float(robot.high()[i])))
+        if np.quantile(np.abs(values), 1.0 - MOST_GLITCHES) > FAR * most and options.units.get(name) != AS_IT_IS:
+            raise NoSource(
+                f"{_beyond(recordings, robot)}: {name} is in another unit than the description's. Convert it (--unit), "
+                f"correct the bounds, or take the column as it is with {unit_option(name, AS_IT_IS)}"
+            )
+
+
+def _beyond(recordings: Sequence[GapFreeRecording], robot: Robot) -> str:
     """Return the ranges of the inputs that leave their bounds, with the bounds."""
     ranges = []
     for i, name in enumerate(column_names(robot)[1]):

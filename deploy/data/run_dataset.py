@@ -14,6 +14,8 @@ from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
+from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.repeated_driving import without_repeats
 
@@ -27,16 +29,20 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
     Returns the data set, and a sentence about its source.
 
     Raises:
-        BadData: the log holds too few steps of the robot.
+        BadData: the log holds too few steps of the robot, or they are of another description.
         LogError: the file does not exist, or is not a log.
     """
     steps: deque[pb.Step] = deque(maxlen=last)
+    described: deque[str] = deque(maxlen=last)  # the description that the file of each step contains
     log, others = open_log(path), Counter[str]()
     for record in log:
         if isinstance(record.message, pb.Step) and record.message.robot == robot.name:
             steps.append(record.message)
+            described.append(log.metadata.get("robots", {}).get(robot.kind, ""))
         else:
             others[record.key] += 1
+    for text in dict.fromkeys(described):
+        _check_described(path, robot, text)
     damage = "".join(f"; {cut}" for cut in log.cuts)
     trajectories, repeats = without_repeats(robot, tuple(trajectories_of(steps, robot)))
     if not trajectories:
@@ -49,6 +55,21 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
     data.check()
     left_out = f"; {repeats} repeated episodes left out" if repeats else ""
     return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{left_out}{damage}"
+
+
+def _check_described(path: Path, robot: Robot, text: str) -> None:
+    """Raise BadData if a description, as JSON text in a log, has other columns or another period than the robot."""
+    try:
+        recorded = robot_from_description(parse_json(text))
+    except ValueError:  # an old log has no description
+        return
+    parts = {"period": "period", "state": "coordinates", "action": "inputs", "heading": "heading"}
+    if changed := [word for name, word in parts.items() if getattr(recorded, name) != getattr(robot, name)]:
+        raise BadData(
+            f"{path} was recorded with another description of {robot.name}: {', '.join(changed)} differ. Get the "
+            f"description of then with `brakeline robot new {robot.kind}.toml --from {path}`, in another folder, or "
+            "record again"
+        )
 
 
 def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterator[Trajectory]:

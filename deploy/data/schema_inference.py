@@ -46,6 +46,7 @@ from brakeline.deploy.data.sources.quantity_names import (
     choice_notes,
     fields_named,
     first_ranked,
+    in_header_unit,
     with_values,
 )
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
@@ -198,7 +199,7 @@ def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Seque
     ramps = [(max(-c.least, c.most), c.change) for c in inputs if not (c.jumps or c.steers) and c.change > 0.0]
     falls = [(max(abs(c.least), abs(c.most)), c.change) for c in braking if c.change > 0.0]
     brake = max((math.ceil(round(min(ENDLESS, most / change), 6)) for most, change in (*ramps, *falls)), default=1)
-    return brake, math.ceil(max((c.delay or 0.0 for c in states), default=0.0) / period)
+    return brake, math.ceil(round(max((c.delay or 0.0 for c in states), default=0.0) / period, 3))
 
 
 def _states(log: AlignedLog, others: Sequence[str], pairs: dict[str, str]) -> list[InferredColumn]:
@@ -309,9 +310,10 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
     inputs = [name for name in places if INPUT.match(name)] or [
         name for name in places if name not in positions and np.mean(np.diff(known[name]) == 0.0) >= HELD
     ]
-    of_headers = {name: table.units[column] for name, (_, column) in places.items() if column in table.units}
-    places, units = _in_si(places, options)
-    return _Fields(places, positions, inputs, of_headers | units, notes=notes)
+    headed = {name: in_header_unit(place) for name, place in places.items() if name not in options.units}
+    places, units = _in_si(places | {name: place for name, (place, _) in headed.items()}, options)
+    units = {name: si for name, (_, si) in headed.items() if si} | units
+    return _Fields(places, positions, inputs, units, notes=notes)
 
 
 def _is_flat(z: Array) -> bool:

@@ -143,8 +143,20 @@ def data_for(robot: Robot) -> Dataset:
         BadData: the description has changed since the recording in more than body, limits and sight.
     """
     lockstep = robot.in_lockstep()
-    data = load_or_record(lockstep)
+    return described_today(load_or_record(lockstep), robot, record_path(lockstep))
+
+
+def described_today(data: Dataset, robot: Robot, path: Path) -> Dataset:
+    """Return a data set of the robot with the robot's description of today: its body, limits and sight.
+
+    Raises:
+        BadData: the description has changed since the recording in more than these.
+    """
+    lockstep = robot.in_lockstep()
     today = replace(data.robot, body=lockstep.body, limits=lockstep.limits, sight=lockstep.sight)
     if today.layout() != lockstep.layout():
-        raise BadData(f"{record_path(lockstep)} was recorded before the description of {robot.name} changed")
+        raise BadData(
+            f"{path} was recorded before the description of {robot.name} changed in more than body, limits and sight: "
+            "import the log again, or record again"
+        )
     return replace(data, robot=robot)

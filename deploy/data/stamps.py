@@ -79,7 +79,7 @@ def stamped(table: Table, column: str = "", unit: str = "") -> Table:
             f"column {name}: in {unit}, the log would have a row every {step * scale:.3g} s, which is not plausible. "
             f"Give the unit of the stamps with --unit {TIME}=ms (or s, us, ns)."
         )
-    time = (stamps - np.nanmin(stamps)) * scale
+    time = (stamps - stamps[valid].min()) * scale
     whole = replace(table, time=time, columns=columns, run=runs, notes=tuple(notes))
     return _cut_at_steps_back(_rows(whole, np.flatnonzero(valid)))
 

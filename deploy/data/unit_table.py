@@ -112,5 +112,7 @@ def chosen_units(words: Iterable[str]) -> dict[str, str]:
         if not name or (factor(unit) is None and unit not in (AS_IT_IS, COMPASS)):
             units = ", ".join((*(one for kind in UNITS.values() for one in kind), COMPASS))
             raise NoSource(f"--unit {word!r} must be NAME=UNIT, where UNIT is one of {units}")
-        chosen[name] = NAMES.get(unit.lower(), unit)
+        unit = NAMES.get(unit.lower(), unit)
+        if chosen.setdefault(name, unit) != unit:
+            raise NoSource(f"--unit names {name!r} twice: {chosen[name]} and {unit}")
     return chosen

@@ -14,6 +14,7 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.blocking_constraint import Planes
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.reachable_tube import Tube
+from brakeline.safety.model.model_set import ModelSet
 
 
 @dataclass(frozen=True)
@@ -37,16 +38,16 @@ class ClearanceMargin:
     largest: float
 
     @classmethod
-    def of(cls, robot: Robot, tube: Tube, given: float | None) -> ClearanceMargin:
+    def of(cls, model: ModelSet, tube: Tube, given: float | None) -> ClearanceMargin:
         """Return the margin that is given [m], or else the one that the tube of turning in place needs.
 
         Raises ValueError: the margin is negative or not finite.
         """
         if given is None:
-            return cls.of_standing(robot, tube)
+            return cls.of_standing(model, tube)
         if not 0.0 <= given < math.inf:  # NaN fails too
             raise ValueError(f"a clearance margin is a finite number of at least 0, not {given:g}")
-        return cls.constant(robot, given)
+        return cls.constant(model.robot, given)
 
     @classmethod
     def constant(cls, robot: Robot, margin: float) -> ClearanceMargin:
@@ -54,16 +55,16 @@ class ClearanceMargin:
         return cls(np.zeros((1, robot.position_dim)), np.array([margin]), robot.heading is not None, margin)
 
     @classmethod
-    def of_standing(cls, robot: Robot, tube: Tube) -> ClearanceMargin:
+    def of_standing(cls, model: ModelSet, tube: Tube) -> ClearanceMargin:
         """Return the margin that the tube of turning in place needs, at the highest turn rate.
 
         tube: of plans in place.
         """
+        robot = model.robot
         if not robot.position_dim:
             return cls.constant(robot, 0.0)
         in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
-        state = robot.state_at_inputs(in_place)
-        z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
+        z = np.concatenate([model.measured_at(in_place), in_place, np.tile(in_place, robot.free_steps)])
         tube = tube.at(z)
         if robot.heading is not None:
             return cls.constant(robot, _turning_extent(robot, tube, z))

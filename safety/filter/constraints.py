@@ -84,9 +84,11 @@ def growth_of(model: ModelSet, tube: Tube) -> float:
     if model.model_config.mode != DIRECT or not robot.position_dim:
         return 1.0
     high = np.asarray(robot.high())
-    speeds = robot.state_at_inputs(high)[list(robot.regressor)]
-    fast = np.concatenate([speeds, high, np.tile(high, robot.free_steps)])
-    half = np.stack([tube.half_widths(z) for z in (0.0 * fast, fast)])  # (2, N, d)
+    plans = [
+        np.concatenate([model.measured_at(inputs), inputs, np.tile(inputs, robot.free_steps)])
+        for inputs in (0.0 * high, high)
+    ]
+    half = np.stack([tube.half_widths(z) for z in plans])  # (2, N, d)
     times = np.sqrt(np.arange(1.0, half.shape[1] + 1.0))[:, None]
     return max(1.0, float((times * half[:, :1] / half).max((1, 2)).min()))
 
@@ -143,7 +145,7 @@ class TubeConstraints:
         self.limits = StateLimits(robot, tube) if robot.limits else None
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
         self._beside = self.measured + clearance.largest + ASIDE + farthest
-        self.stays = stays(robot, tube)
+        self.stays = stays(model, tube)
         if robot.position_dim:
             self.widest = widest_extent(robot, tube, outer, domain, self.body)
             wanted = self.widest + clearance.largest

@@ -106,7 +106,7 @@ class Filter:
         self.domain = np.hstack([recorded, np.tile(of_inputs, robot.committed_steps)])
         turning = model.turning()
         in_place = self.tube if turning is None else turning.tube()
-        margin = ClearanceMargin.of(robot, in_place, clearance_margin)
+        margin = ClearanceMargin.of(model, in_place, clearance_margin)
         self.constraints = TubeConstraints(model, self.tube, outer, recorded, margin)
         self.in_place: tuple[Array, TubeConstraints] | None = None
         if turning is not None and model.in_place is not None:
@@ -150,8 +150,7 @@ class Filter:
 
         In joint space it is the largest half-width of a limit's value, in units of `Robot.limit_scales`.
         """
-        state = self.robot.state_at_inputs(speed)
-        z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
+        z = np.concatenate([self.model.measured_at(speed), speed, np.tile(speed, self.robot.free_steps)])
         tube = self.constraints_for(z).tube
         if not self.robot.position_dim:
             half = np.zeros(self.robot.state_dim)

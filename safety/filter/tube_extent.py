@@ -6,20 +6,20 @@ import numpy as np
 
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.reachable_tube import RolloutTube, Tube
+from brakeline.safety.model.model_set import ModelSet
 
 ROOM_FOR_STRETCH = 1.2  # of the reach of a rollout, whose sets grow with the leverage of a plan
 EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout
 
 
-def stays(robot: Robot, tube: Tube) -> bool:
+def stays(model: ModelSet, tube: Tube) -> bool:
     """Return whether a standing robot stays in place.
 
     A robot that hovers by an estimate may drift: its tube of standing then grows over a plan by more than the
     measurement error, and by more than a tenth of the body's radius.
     """
-    nothing = robot.zero_input()
-    state = robot.state_at_inputs(nothing)[list(robot.regressor)]
-    z = np.concatenate([state, np.tile(nothing, 1 + robot.free_steps)])
+    robot, nothing = model.robot, model.robot.zero_input()
+    z = np.concatenate([model.measured_at(nothing), np.tile(nothing, 1 + robot.free_steps)])
     half = np.abs(tube.directions) @ tube.magnitudes(z)[: tube.generators]
     size = np.linalg.norm(half, axis=1)
     measured = np.linalg.norm(robot.measurement_bound[: robot.position_dim])

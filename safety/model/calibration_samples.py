@@ -54,6 +54,11 @@ def samples_of(data: Dataset) -> Samples:
     robot, N = data.robot, data.robot.horizon
     longest = max(len(t.inputs) for t in data.trajectories)
     whole = len(data.trajectories) >= 4 * FOLDS and longest * FOLDS <= data.periods  # few gaps leave one long rest
+    if longest < N:
+        raise BadData(
+            f"no recording without a gap is as long as a plan ({N} periods): the longest has {longest} periods. Find "
+            "out what cuts the log, or choose a shorter `plan.horizon`"
+        )
     parts: list[tuple[NDArray[Any], ...]] = []
     for number, t in enumerate(data.trajectories):
         periods = len(t.inputs)

@@ -18,7 +18,7 @@ from brakeline.messaging.robot import Array, Robot, refuse_shipped_name, robot_n
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.repeated_driving import repeated_driving
-from brakeline.safety.model.tensor_file import pack, unpack
+from brakeline.safety.model.tensor_file import has_entry, pack, unpack
 
 ENTRY = "dataset"
 RESTLESS = "restless"  # entry in `about`: the number of restless trajectories, which are the last ones
@@ -222,6 +222,14 @@ class Dataset:
             return dict(unpack(path.read_bytes(), ENTRY)[1].get("about", {}))
         except (OSError, ValueError, TypeError):
             return {}
+
+    @staticmethod
+    def check_out(path: Path) -> None:
+        """Raise ValueError if `--out` names something else than a data set or a new file: it would be lost."""
+        if path.is_dir():
+            raise ValueError(f"--out {path} is a folder: give the path of a file, such as data.safetensors")
+        if path.exists() and not has_entry(path.read_bytes(), ENTRY):
+            raise ValueError(f"--out {path} exists, and is no data set: choose another file, or delete it")
 
     def digest(self) -> str:
         """Return a hash of the recorded numbers, 12 hexadecimal digits: the same after `save` and `load`."""

@@ -76,6 +76,17 @@ class ModelSet:
         """The bound for one period, with which the filter compares the next measurement."""
         return self.steps[0]
 
+    def measured_at(self, inputs: Array) -> Array:
+        """Return the measured regressors [x_0] after the speeds have converged to the inputs (m,).
+
+        Coordinates that follow no input are zero, or the recorded value that is nearest to zero: nothing is known of
+        a battery without voltage.
+        """
+        measured = list(self.robot.regressor)
+        nearest_to_zero = np.clip(0.0, *self.domain[:, : len(measured)])
+        follows = np.isin(measured, self.robot.follows)
+        return np.where(follows, self.robot.state_at_inputs(inputs)[measured], nearest_to_zero)
+
     @cached_property
     def _inputs_of(self) -> Array:
         """The map from the regressors of a plan to those of a free window."""

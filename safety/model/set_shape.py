@@ -57,17 +57,23 @@ def stop_from_full_speed(robot: Robot, z: Array, one_step: OneStep) -> Array:
     """Return the regressors (1, nz) of a plan from all inputs at their upper bounds.
 
     Speeds that follow no input, such as a boat's sway, are those at which the predictor settles with these inputs,
-    within what was recorded in z (T, nz), as absolute values: a boat's sway is small, but not in fast turns.
+    within what was recorded in z (T, nz), as absolute values: a boat's sway is small, but not in fast turns. A
+    coordinate that never was zero, such as a battery's voltage, keeps its sign.
     """
     high, measured = np.asarray(robot.high()), list(robot.regressor)
     follows, known = np.isin(measured, robot.follows), len(measured)
-    speeds, largest = robot.state_at_inputs(high)[measured], np.abs(z[:, :known]).max(0)
+    least, most = z[:, :known].min(0), z[:, :known].max(0)
+    one_sided, largest = (least > 0.0) | (most < 0.0), np.maximum(-least, most)
+    low, top = np.where(one_sided, least, -largest), np.where(one_sided, most, largest)
+    start = np.where(follows, robot.state_at_inputs(high)[measured], np.clip(0.0, least, most))
+    speeds = start
     for _ in range(SETTLED):
         window = np.concatenate([speeds, np.tile(high, robot.horizon + 1)])
         after = one_step.rollouts(robot, window[None])[0, -1, measured]
-        after = np.where(np.isfinite(after), np.clip(after, -largest, largest), 0.0)
-        speeds = np.where(follows, speeds, after)
-    plan = np.concatenate([np.where(follows, speeds, np.abs(speeds)), high, np.tile(high, robot.free_steps)])
+        speeds = np.where(follows | ~np.isfinite(after), start, np.clip(after, low, top))
+    plan = np.concatenate(
+        [np.where(follows | one_sided, speeds, np.abs(speeds)), high, np.tile(high, robot.free_steps)]
+    )
     return np.asarray(plan[None] @ plan_regressor_map(robot).T)
 
 

@@ -493,6 +493,19 @@ def test_collecting_splits_where_something_else_moved_the_robot():
     assert cut.trajectories[0].before is None and cut.trajectories[1].before is not None
 
 
+def test_collecting_copies_what_the_environment_writes_again():
+    class Buffered(Toy):
+        path = np.zeros((2, 2))
+
+        def step(self, action):
+            *result, info = super().step(action)
+            self.path[:] = self.count
+            return *result, info | {"subsamples": self.path}
+
+    data = collect(Buffered(CAR), CAR, 20, state=seen, actions=normalised(CAR), shown=False)
+    assert list(data.trajectories[0].paths[:, 0, 0]) == list(range(1, 21))
+
+
 def test_collecting_gives_up_if_every_episode_ends_at_once():
     with pytest.raises(BadData, match="in a row ended before period"):
         collect(Toy(CAR, [Obstacle("cylinder", (0.0, 0.0), (0.1,))]), CAR, 10, state=seen, actions=normalised(CAR))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from brakeline.deploy.data.certification import certify
 from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
@@ -122,6 +123,21 @@ def test_four_minutes_of_free_driving_give_sets_a_quarter_as_wide_as_a_linear_pr
     report = certified()[1]
     assert report.chosen.degree >= 2, "the product of speed and turning, chosen by the out-of-fold error"
     assert report.chosen.error < 0.5 * min(c.error for c in report.candidates if c.degree == 1)
+
+
+def test_a_coordinate_that_is_never_zero_leaves_the_widths_at_rest_and_the_clearance_as_they_are():
+    """A voltage that changes nothing. The widths were those at zero volts: nanometres, because they grew with it."""
+    described = ROBOT.description
+    robot = robot_from_description(described | {"state": described["state"] | {"U": {"unit": "V", "error": 0.0}}})
+    measured = []
+    for of in (ROBOT, robot):
+        data = driven(trajectories=3)
+        volts = [np.full((len(t.states), 1), 5.0 + 2.0 * (i > 0)) for i, t in enumerate(data.trajectories)]
+        parts = zip(data.trajectories, volts, strict=True)
+        more = tuple(replace(t, states=np.hstack([t.states, v]) if of is robot else t.states) for t, v in parts)
+        ready = Filter(fit_one_step(replace(data, robot=of, trajectories=more), CONFIG)[0])
+        measured.append([*(ready.half_width(u) for u in (0.0 * of.high(), of.high())), ready.clearance_margin])
+    assert measured[1] == pytest.approx(measured[0], rel=0.3)
 
 
 def test_lost_rows_at_the_start_of_a_recording_leave_five_even_folds():
@@ -244,6 +260,12 @@ def test_too_little_driving_and_stops_by_feedback_are_refused():
     few = Trajectory(whole.states[:21], whole.inputs[:20], whole.paths[:20], whole.turned[:20])
     with pytest.raises(BadData, match="record at least"):
         fit_one_step(Dataset(ROBOT, (few,)), CONFIG)
+    short = [
+        Trajectory(whole.states[i : i + 3], whole.inputs[i : i + 2], whole.paths[i : i + 2], whole.turned[i : i + 2])
+        for i in range(0, 300, 3)
+    ]
+    with pytest.raises(BadData, match=r"no recording without a gap is as long as a plan .* the longest has 2 periods"):
+        fit_one_step(Dataset(ROBOT, tuple(short)), CONFIG)
     with pytest.raises(ErrorBoundError, match="feedback"):
         fit_one_step(Dataset(puck("puck"), (whole,)), CONFIG)
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
-from brakeline.deploy.data.unit_table import AS_IT_IS, in_si, unknown_unit
+from brakeline.deploy.data.unit_table import AS_IT_IS, factor, in_si, si_of, split_header, unknown_unit
 from brakeline.errors import NoSource
 from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import Robot
@@ -82,6 +82,7 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
     options.check_names(list(wanted_units))
     places: Places = {}
     problems: list[str] = []
+    name_of: dict[tuple[str, str], str] = {}  # of each field that is used
     for name, unit in wanted_units.items():
         if name in options.fields:
             candidates = fields_named(tables, options.fields[name])
@@ -99,8 +100,14 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
                 f"{name}: {', '.join(foreign)} is in no known unit; name it with --unit {name!r}=UNIT. Or convert the "
                 f"column to {unit or '1'}, and take it with --map {name!r}=COLUMN"
             )
+        elif len(candidates) == 1 and (other := name_of.setdefault(_label(candidates[0]), name)) != name:
+            problems.append(
+                f"{name}: {other} is from {candidates[0][1]} too; name another field for one of them with "
+                f"--map {name!r}=TABLE/FIELD"
+            )
         elif len(candidates) == 1:
-            places[name] = _in_unit(candidates[0], name, options.units.get(name, ""), unit)
+            given = options.units.get(name, "")
+            places[name] = _in_unit(candidates[0], name, given, unit) if given else in_header_unit(candidates[0])[0]
         elif candidates:
             many = ", ".join(f"{t.name}/{f}" for t, f in candidates)
             problems.append(
@@ -151,9 +158,25 @@ def with_values(place: Place, values: Array) -> Place:
     return replace(table, columns=table.columns | {column: values}), column
 
 
+def in_header_unit(place: Place) -> tuple[Place, str]:
+    """Return a place in the unit of its header, converted to SI, and the SI unit; empty if the header names none.
+
+    `stamps.in_header_units` converts columns too, but not `NAME [UNIT]` beside a column NAME.
+    """
+    table, column = place
+    unit = "" if table.name else split_header(column)[1]
+    if not unit or si_of(unit) == "s":
+        return place, table.units.get(column, "")
+    return with_values(place, table.columns[column] * (factor(unit) or 1.0)), si_of(unit)
+
+
 def _folded(name: str) -> str:
     """Return a name without case, spaces and signs."""
     return "".join(character for character in name.lower() if character.isalnum())
+
+
+def _label(place: Place) -> tuple[str, str]:
+    return place[0].name, place[1]
 
 
 def _in_unknown_units(candidates: Sequence[Place]) -> list[str]:

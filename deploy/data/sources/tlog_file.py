@@ -33,16 +33,19 @@ def _attitude(c: Columns) -> Columns:
 
 
 def _setpoint(c: Columns) -> Columns:
-    mask, in_world = c["type_mask"].astype(int), c["coordinate_frame"] == dialect.MAV_FRAME_LOCAL_NED
+    mask, in_world, in_body = c["type_mask"].astype(int), *(np.isin(c["coordinate_frame"], f) for f in (WORLD, OF_BODY))
     moves, turns = (mask & VELOCITY_IGNORED) == 0, (mask & YAW_RATE_IGNORED) == 0
     world, body = enu("command.velocity", c, VELOCITY), dict(zip(BODY, (c["vx"], -c["vy"], -c["vz"]), strict=True))
     return {
         **{name: np.where(moves & in_world, values, np.nan) for name, values in world.items()},
-        **{name: np.where(moves & ~in_world, values, np.nan) for name, values in body.items()},
+        **{name: np.where(moves & in_body, values, np.nan) for name, values in body.items()},
         "command.yaw rate": np.where(turns, -c["yaw_rate"], np.nan),
     }
 
 
+# Frames whose velocities are north, east, down, and those whose velocities are forward, right, down.
+WORLD = (dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_LOCAL_OFFSET_NED)
+OF_BODY = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_OFFSET_NED, dialect.MAV_FRAME_BODY_FRD)
 VELOCITY, FORCES = ("vx", "vy", "vz"), ("xacc", "yacc", "zacc")
 BODY = ("command.body.x", "command.body.y", "command.body.z")
 SENT = "SET_POSITION_TARGET_LOCAL_NED"

@@ -8,11 +8,13 @@ import pytest
 from brakeline.deploy.commands.certify_command import CertifyCommand
 from brakeline.deploy.data.certification import MAX_INFLATION, certify
 from brakeline.deploy.data.coverage import coverage, recording_advice
-from brakeline.safety.model.dataset import Trajectory
+from brakeline.errors import BadData
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, ViolationGroup, regimes
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.model.validation import GroupStatement, most_violations, upper_bound, validate
+from tests.deploy.data.porter import FILE, porter
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import record
 
@@ -136,6 +138,19 @@ def test_options_and_advice_of_the_linear_modes_are_not_for_mode_one_step(data, 
     assert CertifyCommand(robot="ground", data=path).run() == 1
     said = capsys.readouterr().err
     assert "one-step: refused:" in said and "--few" not in said, "more driving is missing, whatever the limits"
+
+
+def test_a_data_set_in_a_file_is_certified_for_the_description_of_today(tmp_path):
+    """With --data as without it: the body of today, and no data of a robot that moves otherwise."""
+    file, path, text = tmp_path / "porter.toml", tmp_path / "data.safetensors", FILE.read_text()
+    trajectory = Trajectory(np.zeros((3, 5)), np.zeros((2, 2)), np.zeros((2, 1, 2)), np.zeros(2))
+    Dataset(porter(), (trajectory,)).save(path)
+    file.write_text(text.replace("radius = 0.15", "radius = 0.4"))
+    _, data, _ = CertifyCommand(robot=str(file), data=path)._load()
+    assert [disc.radius for disc in data.robot.body] == [0.4]
+    file.write_text(text.replace("period = 0.2", "period = 0.1"))
+    with pytest.raises(BadData, match=r"the description of porter changed .*: import the log again"):
+        CertifyCommand(robot=str(file), data=path)._load()
 
 
 def test_how_it_drove_is_told_by_inputs_and_speeds():

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.cli import main
+from brakeline.deploy.data.glitches import without_glitches
+from brakeline.deploy.data.held_values import without_held_poses
+from brakeline.deploy.data.sources.source_table import Table
 from brakeline.sim.ground_estimator import wrap
 from tests.deploy.data.porter import COLUMNS, FILE, Porter, drive, driven_by, joystick, write_csv
 
@@ -85,6 +88,49 @@ def test_a_column_that_contradicts_the_motion_is_refused(driven, tmp_path, capsy
     mistake(values)
     status, text = imported(write_csv(tmp_path / "drive.csv", time, values), capsys)
     assert status == 1 and said in text and "Traceback" not in text
+
+
+def test_a_position_of_something_else_is_noted(driven, tmp_path, capsys):
+    """Its motion has no relation to the speed, so no unit, sign or swap explains it."""
+    time, values = driven[0], driven[1].copy()
+    status, text = imported(write_csv(tmp_path / "right.csv", time, values), capsys)
+    assert status == 0 and "agrees little" not in text
+    values[:, X] = 0.5 * np.sin(0.7 * time)
+    status, text = imported(write_csv(tmp_path / "wrong.csv", time, values), capsys)
+    assert status == 0 and "v agrees little with the motion of x, y, heading (correlation 0." in text
+    assert "agrees little" not in imported(tmp_path / "wrong.csv", capsys, "--unit", "v=1")[1]
+
+
+@pytest.fixture
+def steered(driven):
+    """A car's log, as a robot whose measured steering follows its input, and its file."""
+    time, values = driven
+    held, steering = values[:, TURN] / 3.0, np.zeros(len(time))
+    for k in range(1, len(time)):
+        steering[k] = steering[k - 1] + 0.2 * (held[k - 1] - steering[k - 1])
+    return time, np.column_stack([values[:, :W], steering, values[:, SPEED], held])
+
+
+@pytest.mark.parametrize(
+    ("columns", "unit", "said"),
+    [
+        ([W], "", "angle looks like deg: it is 5"),
+        ([TURN], "", "steering looks like deg: it is "),
+        ([], "angle=deg", "angle is in rad already: only without --unit angle=deg"),
+        ([W], "angle=deg", ""),
+        ([W], "angle=1", ""),
+    ],
+)
+def test_a_measured_angle_is_in_the_unit_of_the_input_that_it_follows(steered, tmp_path, capsys, columns, unit, said):
+    """Degrees beside rad: neither the motion nor the correlation of both would show them."""
+    time, values = steered[0], steered[1].copy()
+    values[:, columns] = np.degrees(values[:, columns])
+    text = FILE.read_text().replace('w = { unit = "rad/s"', 'angle = { unit = "rad"').replace("turn rate", "steering")
+    robot = tmp_path / "porter.toml"
+    robot.write_text(text.replace('"steering" = { unit = "rad/s"', '"steering" = { unit = "rad"'))
+    path = write_csv(tmp_path / "drive.csv", time, values, ("x", "y", "heading", "v", "angle", "speed", "steering"))
+    status, text = imported(path, capsys, *(["--unit", unit] if unit else []), robot=robot)
+    assert (status == 0, said in text) == (not said, True), text
 
 
 def test_late_inputs_are_imported_with_the_delay_that_the_error_names(driven, tmp_path, capsys):
@@ -187,21 +233,69 @@ def test_inputs_beyond_their_bounds_are_named_with_their_range(driven, tmp_path,
     assert "windows of a plan's length (5 periods; they overlap)" in text
 
 
+def test_an_input_far_beyond_its_bounds_is_in_another_unit(driven, tmp_path, capsys):
+    """In percent, only values below 1 % are within bounds of 1: the robot would seem to stand at full speed."""
+    time, values = driven[0], driven[1].copy()
+    robot, text = tmp_path / "porter.toml", FILE.read_text()
+    text = text.replace(', follows = "speed"', "").replace('speed = { unit = "m/s"', 'speed = { unit = "1"')
+    text = text.replace("high = 0.6", "high = 1.0")
+    robot.write_text(text)
+    values[:, SPEED] *= 100.0 / 0.6
+    path = write_csv(tmp_path / "drive.csv", time, values)
+    status, text = imported(path, capsys, robot=robot)
+    assert status == 1 and "speed 0 to 100, bounds 0 to 1: speed is in another unit" in text
+    status, text = imported(path, capsys, "--unit", "speed=1", robot=robot)
+    assert "an input was outside the robot's bounds (speed 0 to 100, bounds 0 to 1)" in text
+    values[:, SPEED] /= 100.0
+    assert imported(write_csv(path, time, values), capsys, robot=robot)[0] == 0
+
+
+def test_a_rare_input_within_its_bounds_is_not_said_to_be_cut():
+    values = np.linspace(0.0, 0.1, 500)
+    values[[100, 300]] = 0.9, 9.0
+    table = Table("", np.arange(500.0), {"speed": values}, np.zeros(500, np.intp))
+    places, notes = without_glitches({"speed": (table, "speed")}, [], "", {"speed": (0.0, 1.0)})
+    assert places["speed"][0] is table, "both stay"
+    assert [note.partition(": ")[2].split(": ")[-1] for note in notes] == [
+        "the recording is cut there",
+        "it counts, as it is within the bounds of the input",
+    ]
+
+
 # --- poses that are no measurements ---------------------------------------------------------------------------------
 
 
-def test_rows_that_repeat_a_pose_are_no_measurements(driven, tmp_path, capsys, figures):
+@pytest.mark.parametrize(("columns", "names"), [(slice(W + 1), "x, y, heading"), ([X, Y], "x, y")])
+def test_rows_that_repeat_a_pose_are_no_measurements(driven, tmp_path, capsys, figures, columns, names):
     """As many positions per period, and as large a chord deviation, as the log without these rows."""
     time, values = driven
     held = values.copy()
-    held[:, : W + 1] = values[np.arange(len(values)) // 5 * 5, : W + 1]
+    held[:, columns] = values[np.arange(len(values)) // 5 * 5][:, columns]
     path, out = write_csv(tmp_path / "held.csv", time, held), tmp_path / "a.safetensors"
     report = figures("import", path, "--robot", FILE, "--out", out)["report"]
-    assert any("x, y, heading change only in every 5th row" in note for note in report["notes"])
+    assert any(note.startswith(f"{names} change only in every 5th row") for note in report["notes"])
     sparse = write_csv(tmp_path / "sparse.csv", time[::5], values[::5])
     honest = figures("import", sparse, "--robot", FILE, "--out", out)["report"]
     assert report["samples"] == honest["samples"] == 2
     assert report["chord_deviation"] == pytest.approx(honest["chord_deviation"], rel=0.05)
+
+
+def test_whole_centimetres_of_a_slow_robot_are_measurements(driven, tmp_path, figures):
+    time, values = driven[0], driven[1].copy()
+    values[:, [V, SPEED]] *= 0.2
+    values[:, [X, Y]] = np.round(0.2 * values[:, [X, Y]], 2)
+    path, out = write_csv(tmp_path / "slow.csv", time, values), tmp_path / "a.safetensors"
+    report = figures("import", path, "--robot", FILE, "--out", out)["report"]
+    assert report["samples"] == 10 and not any("repeat" in note for note in report["notes"])
+
+
+def test_repeated_states_in_joint_space_are_no_measurements(driven):
+    time, values = driven[0], driven[1].copy()
+    values[:, [X, Y]] = values[np.arange(len(values)) // 5 * 5][:, [X, Y]]
+    table = Table("", time, {"q1": values[:, X], "q2": values[:, Y]}, np.zeros(len(time), np.intp))
+    places, notes = without_held_poses({name: (table, name) for name in table.columns}, [], "", ["q1", "q2"])
+    assert [note[:38] for note in notes] == ["q1, q2 change only in every 5th row: t"]
+    assert all(np.isfinite(of.columns[name]).mean() == pytest.approx(0.2, abs=0.01) for of, name in places.values())
 
 
 def test_a_pose_that_is_lost_for_seconds_is_left_out(driven, tmp_path, capsys, figures):

@@ -1,5 +1,6 @@
 """Other people's logs: tools take over from each other, damaged logs are read, parsers are confined."""
 
+import math
 import os
 import shutil
 import struct
@@ -19,6 +20,7 @@ from brakeline.deploy.data.importer import OWN, reader_of, tables_of
 from brakeline.deploy.data.sources import isolated_reader
 from brakeline.deploy.data.sources.isolated_reader import ReadLimits, read_here, read_isolated
 from brakeline.deploy.data.sources.source_table import notes_of
+from brakeline.deploy.data.sources.tlog_file import KINDS, SENT
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.errors import LogError, NoSource
 from brakeline.logs.log_recovery import recover
@@ -160,6 +162,17 @@ def test_impossible_stamps_are_left_out(driven, tmp_path):
     path.write_bytes(data)
     tables = read_here("ardupilot_log:read", path)
     assert seconds(tables) < 21.0 and "1 messages with impossible time stamps are left out" in tables[0].notes[0]
+
+
+def test_velocities_of_setpoints_are_of_the_frame_that_they_name():
+    """North 1 m/s, or ahead 1 m/s; of any other frame nothing is known."""
+    world, body = ("LOCAL_NED", "LOCAL_OFFSET_NED"), ("BODY_NED", "BODY_OFFSET_NED", "BODY_FRD")
+    frames = [getattr(dialect, f"MAV_FRAME_{name}") for name in (*world, *body, "LOCAL_FLU", "GLOBAL")]
+    columns = {name: np.zeros(len(frames)) for name in ("type_mask", "vy", "vz", "yaw_rate")}
+    setpoints = KINDS[SENT].quantities(columns | {"vx": np.ones(len(frames)), "coordinate_frame": np.array(frames)})
+    nan = [math.nan]
+    np.testing.assert_array_equal(setpoints["command.velocity.y"], [*[1.0] * 2, *nan * 5])
+    np.testing.assert_array_equal(setpoints["command.body.x"], [*nan * 2, *[1.0] * 3, *nan * 2])
 
 
 def test_a_vehicle_that_restarts_its_clock_is_dated_in_parts(tmp_path):

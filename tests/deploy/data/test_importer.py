@@ -177,6 +177,30 @@ def test_a_recording_at_the_robots_period_is_taken_as_it_is():
     assert lengths(made) == [99], "the first period tells the input in force"
 
 
+@pytest.mark.parametrize(
+    ("rows", "runs", "samples"),
+    [
+        ([*range(0, 15_000, 5), *range(1, 15_000, 5)], 1, 2),  # in pairs, 0.02 and 0.08 s apart
+        ([*range(10_000), *range(10_000, 15_000, 10)], 2, 1),  # a fast run, and a slow one
+    ],
+)
+def test_the_positions_of_a_period_count_where_they_are_few(rows, runs, samples):
+    """Rows that are near each other say nothing about the path in the time without rows."""
+    time, values = drive(seconds=300.0, seed=4)
+    rows = np.sort(rows)
+    sparse = replace(table(time[rows], values[rows]), run=(rows >= 10_000).astype(np.intp) * (runs - 1))
+    assert resample([sparse], porter(), LogOptions()).report.samples == samples
+
+
+def test_the_positions_of_a_period_are_those_of_the_slowest_coordinate():
+    time, values = drive(seconds=120.0, seed=4)
+    whole = table(time, values)
+    seldom = whole.columns["y"].copy()
+    seldom[np.arange(len(time)) % 5 > 0] = np.nan
+    sparse = replace(whole, columns=whole.columns | {"y": seldom})
+    assert [resample([one], porter(), LogOptions()).report.samples for one in (whole, sparse)] == [10, 2]
+
+
 def test_a_state_between_two_samples_shows_nothing_of_the_input_that_follows_it():
     """Odometry every 40 ms, 20 ms beside the inputs, as two nodes that know nothing of each other publish them."""
     robot, rng = Porter(np.random.default_rng(0)), np.random.default_rng(1)
@@ -325,6 +349,17 @@ def test_the_delay_from_input_to_motion_is_found(late):
     assert max(shifted.report.delays.values()) <= 0.021
 
 
+def test_the_delay_is_the_same_whatever_the_clock():
+    """Stamps since 1970 are rounded to 0.2 µs, so an input seems to change a little after its row."""
+    time, values = drive(seconds=120.0, seed=3)
+    late = np.hstack([values[:-8, :5], values[8:, 5:]])
+    by_clock = []
+    for stamped in (0.0, 1764460000.0):
+        stamps = stamped + time[:-8:4]
+        by_clock.append(resample([table(stamps - stamps[0], late[::4])], porter(), LogOptions()).report.delays)
+    assert by_clock == [pytest.approx({"speed": 0.16, "turn rate": 0.16})] * 2
+
+
 def test_paths_between_samples_are_within_the_bound_that_is_said():
     """Seen once a period only, by a robot that changes its mind within one: the bulge holds what was not seen."""
     rng = np.random.default_rng(5)
@@ -348,6 +383,8 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
     assert import_sources([path], porter(), LogOptions.parse(["y=why"])).report.periods > 250
     with pytest.raises(NoSource, match="one of x, y, heading, v, w, speed, turn rate"):
         import_sources([path], porter(), LogOptions.parse(["z=why"]))
+    with pytest.raises(NoSource, match=r"heading: y is from why too; name another field for one of them with --map"):
+        import_sources([path], porter(), LogOptions.parse(["y=why", "heading=why"]))
     slow = write_csv(tmp_path / "slow.csv", driven[0][::25], driven[1][::25])
     with pytest.raises(NoSource, match=r"a sample every 0.5 s: the robot's period of 0.2 s"):
         import_sources([slow], porter())
@@ -360,6 +397,16 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
 
 
 # --- what is said of it ------------------------------------------------------------------------------------------
+
+
+def test_one_field_of_a_message_is_not_two_inputs(driven):
+    """The turn rate of a Twist is not the speed of the left wheel, and of the right wheel."""
+    robot = replace(porter(), action=("left [rad/s]", "right [rad/s]"), follows=(-1, -1))
+    time, values = driven
+    names = ("position.x", "position.y", "yaw", "body.x", "yaw rate", "command.body.x", "command.yaw rate")
+    columns = dict(zip(names, values.T, strict=True))
+    with pytest.raises(NoSource, match=r"right: left is from command\.yaw rate too.*--map 'right'=TABLE/FIELD"):
+        resample([Table("/odom", time, columns, np.zeros(len(time), np.intp))], robot, LogOptions())
 
 
 def test_a_bag_without_stops_is_refused_with_what_to_drive(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Recording, storing, and data from a log."""
 
 import itertools
+import json
 import subprocess
 import sys
 import time
@@ -322,6 +323,18 @@ def test_the_last_steps_of_a_log(tmp_path):
     assert from_log(aged, GROUND, last=60)[0].about == {"origin": "log", ENTRY: "0.2"}
     with pytest.raises(BadData, match="no trajectory of ground"):
         from_log(written(tmp_path / "none.mcap", ()), GROUND, last=60)
+
+
+def test_steps_of_another_description_are_refused(tmp_path):
+    """A step of 0.2 s is none of 0.1 s, and a state in another order is another state. A plan may be longer."""
+    made = [(f"step/ground/{step.actor}", step, i) for i, step in enumerate(steps("a", 0, range(50)))]
+    described = {"robots": {"ground": json.dumps(replace(GROUND, horizon=GROUND.horizon + 1).description)}}
+    log = written(tmp_path / "run.mcap", made, described)
+    assert from_log(log, GROUND, last=60)[0].periods == 49
+    state = (*GROUND.state[:-2], *GROUND.state[:-3:-1])
+    for robot, word in ((replace(GROUND, period=0.1), "period"), (replace(GROUND, state=state), "coordinates")):
+        with pytest.raises(BadData, match=rf"another description of ground: {word} differ.*robot new ground.toml"):
+            from_log(log, robot, last=60)
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])

@@ -92,6 +92,11 @@ def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
     assert horizons[1] == horizons[0] + 2
 
 
+def test_a_delay_of_one_period_is_one_period_but_for_rounding():
+    follower = InferredColumn("v", "m/s", 0.0, 1.0, follows="speed", delay=math.nextafter(0.1, 1.0))
+    assert brake_periods(0.1, [follower], []) == (1, 1)
+
+
 def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
     """Each speed by itself: `speed` is the coordinate, `command speed` the input; the speed changes by 0.05 at most."""
     step, rows, pose, speed = 0.1, [], np.zeros(3), 0.0

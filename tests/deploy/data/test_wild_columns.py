@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -171,15 +172,62 @@ def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsy
     assert f"already: only without --unit {word} does the motion agree" in text and not mine.exists()
 
 
+@pytest.mark.parametrize("stamp", ["", "nan", "inf", "-inf"])
+def test_a_row_without_a_stamp_is_left_out(driven, plain, tmp_path, stamp):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    header, *rows = path.read_text().splitlines()
+    rows[503] = stamp + rows[503][rows[503].index(",") :]  # within a period, and one of ten rows
+    path.write_text("\n".join([header, *rows]) + "\n")
+    data = imported(path)
+    assert data.periods == plain.periods
+    assert np.allclose(data.trajectories[1].states, plain.trajectories[1].states)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16"])
+def test_a_degree_sign_is_one_in_any_encoding(driven, plain, tmp_path, encoding):
+    time, values = driven[0], driven[1].copy()
+    values[:, 2], values[:, 4] = np.degrees(values[:, 2]), np.degrees(values[:, 4])
+    names = [{"heading": "heading (°)", "w": "w [°/s]"}.get(name, name) for name in COLUMNS]
+    path = write_csv(tmp_path / "drive.csv", time, values, names)
+    path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
+    same(imported(path), plain, 1e-8)
+
+
+@pytest.mark.parametrize("command", ["import", "collect"])
+def test_a_file_that_is_no_data_set_is_not_written_over(driven, tmp_path, capsys, command):
+    """Least of all the log itself. A data set may be written again."""
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    imported(path)
+    before, words = path.read_text(), ["import", path, "--robot", FILE] if command == "import" else ["collect"]
+    assert "exists, and is no data set: choose another file" in refused(capsys, [*words, "--out", path])
+    assert path.read_text() == before
+    imported(path)
+
+
 def test_the_unit_1_takes_a_column_as_it_is(driven, plain, tmp_path):
     path = write_csv(tmp_path / "drive.csv", *driven)
     same(plain, imported(path, "--unit", "heading=1", "v=1"), 1e-12)
+
+
+def test_a_header_names_the_unit_of_a_column_beside_one_of_the_same_name(driven, plain, tmp_path):
+    """`speed` in m/s and `speed [km/h]`: whoever maps the second one gets m/s, and need not give --unit."""
+    time, values = driven
+    more, names = np.column_stack([values, 3.6 * values[:, 5]]), (*COLUMNS, "speed [km/h]")
+    path, file = write_csv(tmp_path / "drive.csv", time, more, names), tmp_path / "new.toml"
+    for unit in ([], ["--unit", "speed=km/h"]):
+        same(imported(path, "--map", "speed=speed [km/h]", *unit), plain, 1e-8)
+    places = [f"{name}={name}" for name in ("x", "y", "heading", "v", "w")]
+    main(["robot", "new", str(file), "--from", str(path), "--map", *places, "command speed=speed [km/h]"])
+    assert tomllib.loads(file.read_text())["input"]["command speed"]["high"] == pytest.approx(0.6, abs=0.01)
 
 
 def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
     path = write_csv(tmp_path / "drive.csv", *driven)
     for word, said in (("v=deg", "v is in m/s"), ("v=furlong", "UNIT is one of"), ("why=deg", "must be one of x, y")):
         assert said in refused(capsys, ["import", path, "--robot", FILE, "--unit", word])
+    twice = {"--unit": ["v=km/h", "v=mph"], "--map": ["v=w", "v=speed"]}
+    for option, words in twice.items():
+        assert f"{option} names 'v' twice" in refused(capsys, ["import", path, "--robot", FILE, option, *words])
 
 
 def test_a_unit_that_nobody_knows_is_refused_until_it_is_named(driven, tmp_path, capsys):
