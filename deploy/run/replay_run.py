@@ -28,7 +28,9 @@ from brakeline.logs.reader import Damage, Log, Paths, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.methods import Method, decode, load, ready
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.methods import Method, Model, decode, load, ready
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.server import ModelRegistry
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
@@ -46,28 +48,40 @@ Replacement = Callable[[Robot], Method]  # gives the filter for a robot instead 
 
 @dataclass
 class Archive:
-    """The methods that were in use, by version: from the log, else from the run's folder, else from the data folder."""
+    """The methods that were in use, by version: from the log, else from the run's folder, else from the data folder.
+
+    Attributes:
+        margin: clearance margin of these methods instead of their own [m].
+    """
 
     log: Log
+    margin: float | None = None
     methods: dict[str, Method] = field(default_factory=dict)
 
     def add(self, file: bytes) -> None:
-        """Add a model that was published during the recording. Raises BadModel."""
-        method = ready(decode(file))
+        """Add a model that was published during the recording. Raises BadModel, LogError."""
+        method = self._ready(decode(file))
         self.methods.setdefault(method.version, method)
 
     def method(self, robot: str, version: str) -> Method:
         """Return the method that was in use.
 
         Raises:
-            LogError: its model is nowhere.
+            LogError: its model is nowhere, or has no clearance margin to replace.
             BadModel: its file is damaged or has another layout.
         """
         if version not in self.methods:
-            self.methods[version] = ready(self._model(robot, version))
+            self.methods[version] = self._ready(self._model(robot, version))
         return self.methods[version]
 
-    def _model(self, robot: str, version: str) -> Any:
+    def _ready(self, model: Model) -> Method:
+        if self.margin is None:
+            return ready(model)
+        if not isinstance(model, ModelSet):
+            raise LogError(f"method {model.method} has no clearance margin: leave out --margin")
+        return Filter(model, self.margin)
+
+    def _model(self, robot: str, version: str) -> Model:
         attached = self.log.attachments.get(model_attachment_name(robot, version))
         if attached is not None:
             return decode(attached)
@@ -202,20 +216,26 @@ def _difference(one: Any, other: Any) -> Difference:
     return Difference(float(gap.max(initial=0.0)), bool((gap <= ROUNDING * np.maximum(np.abs(first), 1.0)).all()))
 
 
-def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[], Any] = lambda: None) -> Comparison:
+def replay(
+    paths: Paths,
+    instead: Replacement | None = None,
+    advance: Callable[[], Any] = lambda: None,
+    margin: float | None = None,
+) -> Comparison:
     """Ask for each decision of a log again.
 
     Args:
         paths: files or run folders of the log.
         instead: gives the filter to ask instead of the one in use. It accepts the committed plans of the log.
         advance: is called after each request.
+        margin: clearance margin of the model sets that were in use, instead of their own [m].
 
     Raises:
-        LogError: the paths are no log.
+        LogError: the paths are no log, or a method that was in use has no clearance margin.
         LogError, BadModel: a model that was in use is missing or damaged.
     """
     log = open_log(paths)
-    archive, models, result = Archive(log), ModelRegistry(), Comparison()
+    archive, models, result = Archive(log, margin), ModelRegistry(), Comparison()
     ask, waiting = asking(models), Waiting()
     for record in log:
         if record.topic == "model":

@@ -37,11 +37,19 @@ def test_the_same_version_decides_the_same(log: Path, figures) -> None:
     assert same["fields"] == {} and same["examples"] == [] and same["same_input"] == STEPS
 
 
-def test_a_log_suffices_for_a_replay(log, tmp_path, monkeypatch, figures) -> None:
+def test_a_log_suffices_for_a_replay_also_with_another_margin(log, tmp_path, monkeypatch, figures) -> None:
+    """The model set in use on this machine is another one than that in the log."""
+    margin = Filter(model_for(GROUND, ModelConfig())).clearance_margin
     shutil.copy(log, tmp_path / "elsewhere.mcap")
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
-    again = figures("replay", tmp_path / "elsewhere.mcap")
-    assert again["identical"] + again["equal"] == STEPS
+    for changes in ((), ("--margin", margin)):
+        again = figures("replay", tmp_path / "elsewhere.mcap", *changes)
+        assert again["identical"] + again["equal"] == STEPS, changes
+
+
+def test_a_mode_alone_is_refused(log, command) -> None:
+    status, _, err = command("replay", log, "--mode", "one-step")
+    assert status == 1 and "give --certificate or --data too" in err
 
 
 def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(data_folder, tmp_path, monkeypatch) -> None:
