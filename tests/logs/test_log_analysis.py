@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from brakeline.logs.episode_sampler import SPREAD
+from brakeline.logs.episode_sampler import MOST_STEPS, SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve, interventions_in
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
@@ -205,6 +205,30 @@ def test_the_table_of_an_episode_has_the_recorded_values(
     (drone,) = (detail for detail in figures["episode_detail"] if detail["robot"] == "quadrotor")
     assert "x, y, z [m]" in printed(show_episode(drone), 200)
     assert " ".join(f"{value:.2f}" for value in drone["rows"][0]["state"][:3]) in printed(show_episode(drone), 200)
+
+
+def test_a_long_episode_is_told_to_its_end(tmp_path: Path) -> None:
+    """Ten minutes and more of one robot's driving: its program may never end an episode. One actor starts twice."""
+    writer, length = Writer(losses=0.0), MOST_STEPS + 40
+    for run, steps in ((1, 5), (2, length)):
+        for k in range(steps):
+            step = writer._step("actor-0", 7, k, "ground", 1)
+            step.reward, step.closest = 1.0, 0.5 - 0.1 * (k == length - 3)
+            step.collision = step.terminated = run == 2 and k == length - 1
+            writer.put("exchange/ground/actor-0", writer._exchange(step, 2), run)
+            writer.put("step/ground/actor-0", step, run)
+    writer.write(tmp_path / "run.mcap")
+    figures = analyse_runs(tmp_path, AnalysisOptions(episode=7)).figures()
+    cut, long = figures["episode_detail"]
+    assert cut["outcome"] == "unfinished" and len(cut["rows"]) == 5
+    assert (long["outcome"], long["steps"], long["reward"]) == ("collision", length, length)
+    assert len(long["rows"]) == length and long["rows"][-1]["end"] == "collision"
+    assert long["closest"] == pytest.approx(0.4) and long["closest_at"] == length - 3
+    assert all(row["round_trip_ms"] is not None for row in (*cut["rows"], *long["rows"]))
+    (_, pictures) = analyse_runs(tmp_path, AnalysisOptions(pictures=True)).by_label()[tmp_path.name]
+    drawn = pictures["galleries"]["ground"]["episodes"][-1]
+    assert (drawn["outcome"], drawn["steps"], len(drawn["x"])) == ("collision", length, MOST_STEPS)
+    assert drawn["interventions"] == figures["interventions"] - cut["interventions"]
 
 
 def test_the_nearest_misses_are_the_nearest(analysis: LogAnalysis, messages: Messages) -> None:
