@@ -115,7 +115,7 @@ class EpisodeSampler:
     Attributes:
         label: prefix of the run.
         sketches: most episodes in short.
-        wanted: number of an episode that is always selected, of every actor or only of `actor`.
+        wanted: number of an episode that is always selected, of every actor or only of `actor` (with or without label).
         requested_episodes: the episodes with this number, with all their steps.
     """
 
@@ -212,7 +212,7 @@ class EpisodeSampler:
                 self._spread = {k: item for k, item in self._spread.items() if k % self._stride == 0}
         if order % self._sketch_stride == 0:
             self._sketch(episode, order)
-        if episode.number == self.wanted and self.actor in (None, episode.actor):
+        if episode.number == self.wanted and self.actor in (None, episode.actor, episode.last.actor):
             self.requested_episodes.append(pictured() | {"rows": list(rows(episode, self.robot))})
 
     def _sketch(self, episode: EpisodeRecord, order: int) -> None:

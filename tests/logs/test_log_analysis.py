@@ -129,6 +129,13 @@ def test_runs_are_labelled_and_merged(two: Two) -> None:
     assert [run["messages"] for run in both["runs"].values()] == messages
 
 
+def test_an_actor_is_found_in_several_runs_with_and_without_the_run_in_its_name(tmp_path: Path) -> None:
+    folders = [mixed(tmp_path / "one", 5, 8), mixed(tmp_path / "two", 6, 8)]
+    for actor, found in (("actor-1", ["one/actor-1", "two/actor-1"]), ("two/actor-1", ["two/actor-1"])):
+        detail = analyse_runs(folders, AnalysisOptions(episode=3, actor=actor)).figures()["episode_detail"]
+        assert [episode["actor"] for episode in detail] == found
+
+
 def test_a_process_of_an_earlier_run_is_not_silent_in_a_later_one(two: Two) -> None:
     single, both = two
     for label, figures in zip(("one", "two"), single, strict=True):
