@@ -22,6 +22,7 @@ from mcap.records import Attachment, Metadata
 from brakeline.errors import Implausible, LogError, NotMcap
 from brakeline.logs.mcap_container import (
     BROKEN,
+    MAGIC,
     DamagedBytes,
     LogChannel,
     Row,
@@ -235,6 +236,15 @@ def find(paths: Paths) -> tuple[Path, ...]:
     for path in logs.values():
         runs.setdefault(_run_of(path), []).append(path)
     return tuple(path for segments in runs.values() for path in sorted(segments, key=number_of))
+
+
+def keep_log(path: Path) -> None:
+    """Check that a file that you will write is not a log, which would be lost. Raises LogError."""
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) == MAGIC:
+            raise LogError(f"{path} is a log, and is not overwritten: give the file to write another name")
 
 
 def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
