@@ -81,6 +81,8 @@ def test_training_rates_are_those_of_the_steps_in_each_bin(figures: dict[str, An
         assert row["episodes"] == sum(s.terminated or s.truncated for s in own)
         assert row["closest"] == min(map(least_clearance, own))
     assert training["bins"][-1]["until"] == len(steps)
+    collisions = sum(row["collisions"] for row in training["bins"])
+    assert collisions == figures["robots"]["ground"]["collisions"], "also of an episode whose end is lost"
     ended = [step for step in steps if step.terminated or step.truncated]
     last = training["last"]
     assert last["episodes"] == min(100, len(ended)) > 20
@@ -297,13 +299,15 @@ def test_bins_become_wider_instead_of_more() -> None:
     assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
 
 
-def test_curves_count_the_interventions_that_the_summary_counts() -> None:
+def test_curves_count_the_interventions_and_collisions_that_the_summary_counts() -> None:
+    """A program of your own may drive on after a collision."""
     curve, kinds = LearningCurve(), [pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING, pb.RECOVERING]
     for k, kind in enumerate(kinds):
-        curve.step(pb.Step(actor="a", step=k, decision=kind, truncated=k == 4))
+        curve.step(pb.Step(actor="a", step=k, decision=kind, truncated=k == 4, collision=k in (1, 2)))
     figures = curve.figures()
     (row,) = figures["bins"]
     assert interventions_in(row) == pytest.approx(figures["last"]["interventions"]) == 0.8
+    assert row["collisions"] == figures["last"]["collisions"] == 1
     before = {name: value for name, value in row.items() if name != "recovering"}
     assert interventions_in(before) == pytest.approx(0.4), "a row that an earlier version wrote"
 
