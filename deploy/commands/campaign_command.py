@@ -119,7 +119,7 @@ class CampaignCommand:
             console.print(plain_table(*campaign.cell_table(driven)))
             if worst_cases:
                 console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(worst_cases)))
-            console.print(f"[dim]{self.results}: {own}.md, {own}.json[/]")
+            console.print(f"{self.results}: {own}.md, {own}.json", style="dim", markup=False)
         return {"robot": own} | new
 
     def _perturbations(self, dimensions: int) -> list[str]:

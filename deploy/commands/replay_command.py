@@ -99,7 +99,7 @@ def print_comparison(figures: dict[str, Any]) -> None:
     compared = figures["requests"] - figures["unanswered"]
     changes = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
     heading = f"decided again with {changes}" if changes else "decided again"
-    console.print(f"{heading}: {compared} requests; {figures['unanswered']} had no answer")
+    console.print(f"{heading}: {compared} requests; {figures['unanswered']} had no answer", markup=False)
     console.print(f"identical in every bit: {share(figures['identical'], compared, digits=2)}")
     largest = f"; at most {figures['rounding']:.1g}" if figures["equal"] else ""
     equal = f"{share(figures['equal'], compared, digits=2)}{largest}"
