@@ -42,7 +42,8 @@ ROUNDING = 1e-12  # largest difference of equal numbers, relative to the number 
 EXAMPLES = 20  # differences that the figures list, the largest ones
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
-Waiting = dict[tuple[tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]  # incomplete fleet requests
+# Incomplete requests of a fleet, by the start of its process, its robots, episode and step.
+Waiting = dict[tuple[int, tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]
 Replacement = Callable[[Robot], Method]  # gives the filter for a robot instead of the one in use
 
 
@@ -248,7 +249,7 @@ def replay(
         if _from_before_known_free(request, logged):
             request.known_free = True
         advance()
-        joint = _joint_requests(waiting, request, logged)
+        joint = _joint_requests(waiting, record.message)
         if any(reply.WhichOneof("result") is None for _, reply in joint):
             result.requests += len(joint)
             result.unanswered += len(joint)
@@ -267,6 +268,10 @@ def replay(
         for (request, logged), reply in zip(joint, replies, strict=True):
             result.add(request, logged, reply, () if instead is None else ("model",))
     result.damage = log.damage
+    if alone := sum(map(len, waiting.values())):
+        result.damage.cuts.append(
+            f"{alone} requests of a fleet are not compared: those of its other robots are missing"
+        )
     return result
 
 
@@ -279,11 +284,12 @@ def _from_before_known_free(request: pb.Request, logged: pb.Reply) -> bool:
     return not described and logged.error.field != "obstacles"
 
 
-def _joint_requests(waiting: Waiting, request: pb.Request, logged: pb.Reply) -> list[tuple[pb.Request, pb.Reply]]:
+def _joint_requests(waiting: Waiting, exchange: pb.Exchange) -> list[tuple[pb.Request, pb.Reply]]:
     """Return the requests that were sent together: one, or those of all robots of a fleet once the last one is read."""
+    request, logged = exchange.request, exchange.reply
     if not request.fleet:
         return [(request, logged)]
-    key = tuple(request.fleet), request.episode, request.step
+    key = exchange.header.run, tuple(request.fleet), request.episode, request.step
     group = waiting.setdefault(key, {})
     group[request.actor] = request, logged
     if group.keys() != set(request.fleet):

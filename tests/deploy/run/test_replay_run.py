@@ -142,6 +142,20 @@ def test_a_replay_says_what_it_could_not_read(damaged: Path, tmp_path: Path, com
     assert status == 1 and "no request could be read" in err
 
 
+def test_a_replay_says_which_requests_of_a_fleet_it_could_not_decide_again(data_folder: Path, tmp_path: Path) -> None:
+    """Those of the other robots are not in the log, or were sent by another start of the process."""
+
+    def together(exchange: pb.Exchange) -> None:
+        if exchange.request.step < 3:
+            exchange.request.fleet[:] = ["actor-0", "actor-1"]
+
+    drive(tmp_path / "a" / "run.mcap", 8, together)
+    drive(tmp_path / "b" / "run.mcap", 8, together, actor="actor-1", run=2)
+    replayed = replay([tmp_path / "a", tmp_path / "b"])
+    assert (replayed.requests, replayed.different) == (10, 0)
+    assert any("6 requests of a fleet are not compared" in line for line in replayed.damage.lines)
+
+
 def test_a_log_that_begins_after_a_change_of_models_has_no_stale_models(data_folder: Path, tmp_path: Path) -> None:
     def verified_before(exchange: pb.Exchange) -> None:
         if exchange.request.model:
