@@ -135,8 +135,12 @@ class TrainCommand(RunConfig):
 
     def run(self) -> int:
         """Run the training. Returns the exit status."""
-        folder = self.resume or self.out or dated_folder()
-        return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
+        from brakeline.logs.reader import find
+
+        folder, config = self.resume or self.out or dated_folder(), self.config()
+        if config.from_logs:
+            find(config.from_logs)  # a mistyped path ends the command before it starts a process
+        return train(config, folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
 
 
 def train(

@@ -45,14 +45,15 @@ class LoggedSteps:
 
     The names of actors of the n-th run, from the second on, end in `.run<n>`. An actor that was started again and
     counted its episodes anew is another one, whose name has `.session<n>`. After the iteration `counts` has the numbers
-    of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values. `damage` has a line for
-    each part that could not be read.
+    of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values, and `reason` says what is
+    wrong with the first one. `damage` has a line for each part that could not be read.
     """
 
     logs: Sequence[str]
     robot: RobotWithTask
     counts: Counter[str] = field(default_factory=Counter)
     damage: list[str] = field(default_factory=list)
+    reason: str = ""
 
     def __iter__(self) -> Iterator[pb.Step]:
         intake = StepReader(self.robot)
@@ -65,8 +66,9 @@ class LoggedSteps:
                 step: pb.Step = record.message
                 try:
                     intake.move(step)
-                except BadStep:
+                except BadStep as error:
                     self.counts["unusable"] += 1
+                    self.reason = self.reason or str(error)
                     continue
                 step.actor = sessions.name(step)
                 if not ledger.record(step.actor, step.episode, step.step, step.index):
@@ -103,13 +105,17 @@ def count(logs: Sequence[str], robot: RobotWithTask) -> int:
 
     Raises:
         LogError: a path is no log.
-        ValueError: the logs have no steps of this robot.
+        ValueError: the logs have no steps of this robot, or none that teaches anything.
     """
-    total = sum(1 for _ in LoggedSteps(logs, robot))
-    if not total:
+    steps, named = LoggedSteps(logs, robot), ", ".join(map(str, logs))
+    total = sum(1 for _ in steps)
+    if not total and (unusable := steps.counts["unusable"]):
         raise ValueError(
-            f"no steps of {robot.name} in {', '.join(map(str, logs))}: name a log that recorded this robot"
+            f"none of the {unusable} steps of {robot.name} in {named} can be learned from ({steps.reason}): name "
+            "the log of a run, whose steps have what the robot's task observes"
         )
+    if not total:
+        raise ValueError(f"no steps of {robot.name} in {named}: name a log that recorded this robot")
     return total
 
 
@@ -169,6 +175,8 @@ def _feed(process: Process, settings: FeederSettings) -> bool:
         figures["published"] += 1
     for line in steps.damage:
         log.warning("not learned from: %s", line)
+    if unusable := steps.counts["unusable"]:
+        log.warning("not learned from: %d unusable steps (%s)", unusable, steps.reason)
     log.info("published %d logged steps; the learner knew %d", figures["published"], figures["known"])
     deadline = time.monotonic() + (LAST_UPDATES_TIMEOUT if settings.alone else 0.0)
     while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):

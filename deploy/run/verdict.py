@@ -35,6 +35,7 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     if fed := figures.get("from_logs"):
         lines.append(
             f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner had already"
+            + (f"; {fed['unusable']} are unusable, see {figures['folder']}/logs" if fed.get("unusable") else "")
         )
     if not figures["log"]:
         lines.append(f"no log was recorded; policies: {', '.join(figures['policies']) or 'none'}")

@@ -41,6 +41,10 @@ def test_unusable_steps_are_counted_and_left_out(tmp_path: Path) -> None:
     steps = LoggedSteps([str(tmp_path)], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 4)]
     assert steps.counts == {"taken": 2, "unusable": 2}  # the reader has passed over the reward that is no number
+    (tmp_path / "own").mkdir()
+    record(tmp_path / "own" / "run.mcap", *bad)
+    with pytest.raises(ValueError, match=r"none of the 2 steps of ground .* \(observation: 1 values, not 26\)"):
+        count([str(tmp_path / "own")], GROUND)
 
 
 def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: Path) -> None:
