@@ -43,6 +43,8 @@ class FeederSettings:
 class LoggedSteps:
     """The steps of a robot kind in logs that a learner can use, each once, in the order of the log.
 
+    A copy of a log in the same folder, such as one that `brakeline export --foxglove` wrote, adds nothing.
+
     The names of actors of the n-th run, from the second on, end in `.run<n>`. An actor that was started again and
     counted its episodes anew is another one, whose name has `.session<n>`. After the iteration `counts` has the numbers
     of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values, and `reason` says what is
@@ -56,9 +58,9 @@ class LoggedSteps:
     reason: str = ""
 
     def __iter__(self) -> Iterator[pb.Step]:
-        intake = StepReader(self.robot)
+        intake, known = StepReader(self.robot), set[tuple[str, int, int]]()
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
-            ledger, sessions = StepLedger(), _Sessions()
+            ledger, sessions, copied = StepLedger(), _Sessions(), dict[tuple[str, int], bool]()
             log_of_run = open_log(files)
             for record in log_of_run:
                 if record.topic != "step" or record.message.robot != self.robot.name:
@@ -70,6 +72,9 @@ class LoggedSteps:
                     self.counts["unusable"] += 1
                     self.reason = self.reason or str(error)
                     continue
+                if _is_copied(step, copied, known):
+                    self.counts["duplicate"] += 1
+                    continue
                 step.actor = sessions.name(step)
                 if not ledger.record(step.actor, step.episode, step.step, step.index):
                     self.counts["duplicate"] += 1
@@ -79,6 +84,20 @@ class LoggedSteps:
                     step.actor = f"{step.actor}.run{number}"
                 yield step
             self.damage += log_of_run.damage.lines
+
+
+def _is_copied(step: pb.Step, copied: dict[tuple[str, int], bool], known: set[tuple[str, int, int]]) -> bool:
+    """Return whether an earlier log has the steps of this start of the actor. A folder may have a copy of a log.
+
+    Args:
+        copied: the starts in this log, and whether an earlier log has them; known: the first step of each start.
+    """
+    start = step.actor, step.header.run
+    if start not in copied:
+        first = (*start, step.header.wall_time)
+        copied[start] = step.header.wall_time > 0 and first in known
+        known.add(first)
+    return copied[start]
 
 
 class _Sessions:

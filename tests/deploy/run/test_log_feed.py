@@ -59,6 +59,15 @@ def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: 
         count([str(tmp_path / "one")], QUADROTOR)
 
 
+def test_a_copy_of_a_log_in_its_folder_teaches_nothing_twice(tmp_path: Path) -> None:
+    for run in (1, 2):
+        steps = [step(i, header=pb.Header(run=run, wall_time=10**9 * run + i)) for i in range(3)]
+        record(tmp_path / "run.mcap", *steps)  # of another start in run_0001.mcap
+    shutil.copy(tmp_path / "run.mcap", tmp_path / "pictures.mcap")
+    steps_of_folder = LoggedSteps([str(tmp_path)], GROUND)
+    assert len(names(steps_of_folder)) == 6 and steps_of_folder.counts == {"taken": 6, "duplicate": 3}
+
+
 def test_two_sessions_of_an_actor_in_one_log_are_two_actors_and_a_restart_is_one(tmp_path: Path) -> None:
     first = [step(i, header=pb.Header(run=1)) for i in range(2)]
     restarted = [step(i, episode=1, header=pb.Header(run=2)) for i in range(2)]
