@@ -12,6 +12,7 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as Remaining
+from rich.text import Text
 
 FIRST = 2.0  # s until the first line; shorter work prints none
 AGAIN = 10.0  # s between two lines
@@ -43,7 +44,7 @@ def by_share(advance: Advance) -> Callable[[float], None]:
 
 def say(name: str, text: str) -> None:
     """Print the progress of a part of a study."""
-    console.print(f"[dim]{name}:[/] {text}")
+    console.print(Text.assemble((f"{name}:", "dim"), " ", text))
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 
-from brakeline.logs.episode_stats import Figures, closest_of, kind_of
+from brakeline.logs.episode_stats import INTERVENTIONS, Figures, closest_of, kind_of
 from brakeline.logs.episode_view import FEW_TUBES, MOST_TUBES, picture, rows, sketch
 from brakeline.logs.json_values import finite
 from brakeline.messaging import brakeline_pb2 as pb
@@ -27,7 +27,7 @@ SPREAD = 24
 SKETCHES = 2000  # episodes in short; of a longer log, evenly spread ones
 MOST_POINTS, FEWEST_POINTS = 40, 6  # steps in a sketch
 POINTS = 8000  # a new sketch has about this many steps, divided by the number of episodes so far
-MOST_STEPS = 3000  # steps of one episode in memory
+MOST_STEPS = 3000  # steps of one episode in memory; of the wanted one, all
 MOST_EXCHANGES = 600  # latest exchanges of one actor in memory
 
 
@@ -38,40 +38,54 @@ class EpisodeRecord:
     label: str  # prefix of the run; empty if there is only one run
     number: int
     about: pb.Episode | None  # None: the log does not have the beginning of the episode
-    steps: list[pb.Step] = field(default_factory=list)
+    steps: list[pb.Step] = field(default_factory=list)  # those in memory; the counts below are of all
+    count: int = 0
+    last: pb.Step = field(default_factory=pb.Step)
+    reward: float = 0.0
+    collided: bool = False
     closest: float = math.inf  # m
+    interventions: int = 0
     failsafes: int = 0
     until: int = 0  # steps of all actors of the robot kind up to the episode's latest step
     actor_exchanges: Iterable[pb.Exchange] = ()  # of this actor, also of other episodes
     other_exchanges: Iterable[pb.Exchange] = ()  # of the other robots of the world, also of other episodes
+    whole: bool = False  # keep all steps in memory
 
     def add(self, step: pb.Step) -> None:
-        if len(self.steps) < MOST_STEPS:
+        if self.whole or len(self.steps) < MOST_STEPS:
             self.steps.append(step)
-        closest = closest_of(step)
+        self.count, self.last = self.count + 1, step
+        self.reward += step.reward
+        self.collided = self.collided or step.collision
+        closest, kind = closest_of(step), kind_of(step)
         if closest < self.closest:
             self.closest = closest
-        self.failsafes += kind_of(step) == pb.FAILSAFE
+        self.interventions += kind in INTERVENTIONS
+        self.failsafes += kind == pb.FAILSAFE
 
     def exchanges(self) -> dict[int, pb.Exchange]:
         """Return the episode's exchanges by step."""
-        return {e.request.step: e for e in self.actor_exchanges if e.request.episode == self.number}
+        return {e.request.step: e for e in self.actor_exchanges if self._has(e)}
 
     def exchanges_of_others(self) -> dict[int, list[pb.Exchange]]:
         """Return the exchanges of the other robots of the world, by step."""
         by_step: dict[int, list[pb.Exchange]] = {}
         for e in self.other_exchanges:
-            if e.request.episode == self.number:
+            if self._has(e):
                 by_step.setdefault(e.request.step, []).append(e)
         return by_step
 
+    def _has(self, exchange: pb.Exchange) -> bool:
+        """Return whether this is an exchange of the episode. An actor that was started again may repeat a number."""
+        return exchange.request.episode == self.number and exchange.header.run == self.last.header.run
+
     @property
     def actor(self) -> str:
-        return self.label + self.steps[0].actor
+        return self.label + self.last.actor
 
     def outcome(self) -> str:
-        last = self.steps[-1]
-        if any(step.collision for step in self.steps):
+        last = self.last
+        if self.collided:
             return "collision"
         if last.contact_moving or last.contact_standing:
             return "run into" if last.contact_standing else "contact"
@@ -83,9 +97,10 @@ class EpisodeRecord:
 
 
 class ActorBuffer:
-    """The running episode and the latest messages of one actor."""
+    """The running episode and the latest messages of one actor, and all exchanges of the wanted episode."""
 
     def __init__(self) -> None:
+        self.wanted: list[pb.Exchange] = []
         self.running: EpisodeRecord | None = None
         self.about: deque[pb.Episode] = deque(maxlen=2)
         self.exchanges: deque[pb.Exchange] = deque(maxlen=MOST_EXCHANGES)
@@ -100,7 +115,7 @@ class EpisodeSampler:
     Attributes:
         label: prefix of the run.
         sketches: most episodes in short.
-        wanted: number of an episode that is always selected, of every actor or only of `actor`.
+        wanted: number of an episode that is always selected, of every actor or only of `actor` (with or without label).
         requested_episodes: the episodes with this number, with all their steps.
     """
 
@@ -139,10 +154,17 @@ class EpisodeSampler:
         if episode is None or episode.number != number or step.step == 0:
             if episode is not None:
                 self._ended(source, episode)
-            episode = source.running = EpisodeRecord(self.label, number, source.episode(number))
+            about, whole = source.episode(number), number == self.wanted
+            episode = source.running = EpisodeRecord(self.label, number, about, whole=whole)
         episode.add(step)
         self._steps += 1
         episode.until = self._steps
+
+    def exchange(self, source: ActorBuffer, exchange: pb.Exchange) -> None:
+        """Add an exchange of an actor."""
+        source.exchanges.append(exchange)
+        if exchange.request.episode == self.wanted:
+            source.wanted.append(exchange)
 
     def close(self) -> None:
         """Evaluate the running episodes: the run has ended."""
@@ -174,9 +196,9 @@ class EpisodeSampler:
         """Select the episode if it belongs to one of the groups. Only then is its picture computed, once."""
         order, self._count = self._count, self._count + 1
         pictured = cache(partial(self._picture, episode, order))
-        episode.actor_exchanges = source.exchanges
+        episode.actor_exchanges = source.wanted if episode.whole else source.exchanges
         episode.other_exchanges = self._others(source, episode)
-        self.last = replace(episode, actor_exchanges=list(source.exchanges))
+        self.last = replace(episode, actor_exchanges=list(episode.actor_exchanges))
         if math.isfinite(episode.closest):
             _push(self._nearest, -episode.closest, NEAREST, pictured, order)
         if episode.failsafes:
@@ -190,7 +212,7 @@ class EpisodeSampler:
                 self._spread = {k: item for k, item in self._spread.items() if k % self._stride == 0}
         if order % self._sketch_stride == 0:
             self._sketch(episode, order)
-        if episode.number == self.wanted and self.actor in (None, episode.actor):
+        if episode.number == self.wanted and self.actor in (None, episode.actor, episode.last.actor):
             self.requested_episodes.append(pictured() | {"rows": list(rows(episode, self.robot))})
 
     def _sketch(self, episode: EpisodeRecord, order: int) -> None:

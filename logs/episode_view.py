@@ -110,16 +110,16 @@ def rows(episode: EpisodeRecord, robot: Robot | None) -> Iterable[Figures]:
 
 def _summary(episode: EpisodeRecord, closest: int) -> Figures:
     """Return who drove, how it ended, and its counts."""
-    first, steps = episode.steps[0], episode.steps
+    first = episode.steps[0]
     return {
         "actor": episode.actor,
         "robot": first.robot,
         "episode": episode.number,
         "outcome": episode.outcome(),
-        "steps": len(steps),
+        "steps": episode.count,
         "first": first.step,
-        "reward": math.fsum(step.reward for step in steps),
-        "interventions": sum(kind_of(step) in INTERVENTIONS for step in steps),
+        "reward": episode.reward,
+        "interventions": episode.interventions,
         "failsafes": episode.failsafes,
         "closest": episode.closest if math.isfinite(episode.closest) else None,
         "closest_at": closest,

@@ -133,7 +133,7 @@ def show_episode(episode: Figures) -> RenderableType:
     return Group(Text(title, "bold"), plain_table(columns, rows))
 
 
-def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
+def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
     """Yield a name and a value of each figure of one run."""
     episodes, steps = figures["episodes"], figures["steps"]
     within = figures.get("intervals") or {}
@@ -142,7 +142,7 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
         yield "configuration", ", ".join(setup)
     yield "steps", f"{steps}" + known(", {:.1f}/s", figures.get("steps_per_s"))
     if figures.get("refused"):
-        yield "[red]steps that do not count[/]", f"{figures['refused']}: repeated, or not permitted by the learner"
+        yield Text("steps that do not count", "red"), f"{figures['refused']}: repeated, or not permitted by the learner"
     stated = figures.get("outcomes_stated", True)
     yield "episodes", f"{episodes}" + (known(", mean reward {:.2f}", figures["mean_reward"]) if stated else "")
     if not stated:
@@ -180,7 +180,7 @@ def for_clearance(figures: Figures) -> str:
     return f"{figures['for_clearance']} of {figures['adjusted']} adjusted steps: the filter verified the proposal too"
 
 
-def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
+def _safety_rows(figures: Figures) -> Iterator[tuple[str | Text, str]]:
     """Yield the rows that need the exchanges with the safety service."""
     if figures.get("round_trip_ms"):
         yield "request to reply", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"])
@@ -208,7 +208,7 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
         yield "slowed down", f"{share(plans['slowed'], figures['steps'])} of the steps, {plans['slow_downs']} times"
     for name, label in (("unverified", "unverified failsafes"), ("not_finite", "proposals with NaN or infinity")):
         if figures.get(name):
-            yield f"[red]{label}[/]", str(figures[name])
+            yield Text(label, "red"), str(figures[name])
 
 
 NOT_STATED = "not recorded: the program did not call `record_outcome`, nor `reset` with an outcome"

@@ -115,12 +115,13 @@ class LearningCurve:
         episode.reward += step.reward
         episode.steps += 1
         episode.interventions += kind in INTERVENTIONS
-        episode.collision = episode.collision or step.collision
+        if step.collision and not episode.collision:
+            episode.collision = True
+            now["collisions"] += 1
         if step.terminated or step.truncated:
             episode.goal = step.goal
             now["episodes"] += 1
             now["goals"] += step.goal
-            now["collisions"] += step.collision
             now.reward += episode.reward
             self.last.append(self._running.pop(actor))
 

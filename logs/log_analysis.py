@@ -128,7 +128,8 @@ class RunAnalysis:
         if robot not in self.intervention_maps:
             self.intervention_maps[robot] = InterventionMap(self.log.robots.named(robot))
         self.intervention_maps[robot].exchange(exchange)
-        self._buffer(channel)[1].exchanges.append(exchange)
+        sampler, buffer = self._buffer(channel)
+        sampler.exchange(buffer, exchange)
 
     def _buffer(self, channel: LogChannel) -> tuple[EpisodeSampler, ActorBuffer]:
         """Return the sampler of the channel's robot kind, and the buffer of its actor."""

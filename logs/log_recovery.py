@@ -31,7 +31,7 @@ class Recovery:
 
     Attributes:
         path: the repaired file.
-        kept: where the damaged file is now; None if the file was intact and nothing was done.
+        kept: where the damaged file is now, or the intact one that was copied; None if nothing was done.
         messages: number of messages in the file.
         last: receipt of the last message, ns since the Unix epoch.
         lost: bytes that could not be read.
@@ -48,6 +48,8 @@ class Recovery:
     def __str__(self) -> str:
         if self.kept is None:
             return f"{self.path}: intact, {self.messages} messages; nothing to do"
+        if not self.cuts:
+            return f"{self.path}: {self.messages} messages, a copy of {self.kept}, which is intact"
         damage = "; ".join(self.cuts)
         return f"{self.path}: {self.messages} messages recovered; {damage}; the damaged file is {self.kept}"
 

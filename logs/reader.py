@@ -22,6 +22,7 @@ from mcap.records import Attachment, Metadata
 from brakeline.errors import Implausible, LogError, NotMcap
 from brakeline.logs.mcap_container import (
     BROKEN,
+    MAGIC,
     DamagedBytes,
     LogChannel,
     Row,
@@ -211,11 +212,13 @@ class Log:
 def find(paths: Paths) -> tuple[Path, ...]:
     """Return the files at `paths`: for a folder all its logs, for run.mcap also its segments run_0001.mcap ….
 
+    A file counts once, however many paths and links lead to it: `runs/*` has the newest run also as `runs/latest`.
+
     Raises:
         LogError: a path has no log.
     """
     given = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    logs: dict[Path, None] = {}
+    logs: dict[Path, Path] = {}
     for path in map(Path, given):
         if path.is_dir():
             files = list(path.glob("*.mcap"))
@@ -227,8 +230,21 @@ def find(paths: Paths) -> tuple[Path, ...]:
             files = []
         if not files:
             raise LogError(f"no log at {path}: give an .mcap file or the folder of a run")
-        logs.update(dict.fromkeys(sorted(files, key=number_of)))
-    return tuple(logs)
+        for file in sorted(files, key=number_of):
+            logs.setdefault(file.resolve(), file)
+    runs: dict[tuple[Path, str], list[Path]] = {}
+    for path in logs.values():
+        runs.setdefault(_run_of(path), []).append(path)
+    return tuple(path for segments in runs.values() for path in sorted(segments, key=number_of))
+
+
+def keep_log(path: Path) -> None:
+    """Check that a file that you will write is not a log, which would be lost. Raises LogError."""
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) == MAGIC:
+            raise LogError(f"{path} is a log, and is not overwritten: give the file to write another name")
 
 
 def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
@@ -238,7 +254,7 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     """
     runs: dict[str, tuple[Path, ...]] = {}
     for (folder, name), files in groupby(paths, key=_run_of):
-        place = folder.resolve().name
+        place = folder.name
         label = place if name == "run" else f"{place}/{name}"
         namesakes = sum(other == label or other.startswith(f"{label} (") for other in runs)
         runs[f"{label} ({namesakes + 1})" if namesakes else label] = tuple(files)
@@ -266,16 +282,20 @@ def count_by_key(path: Path) -> Counter[str]:
 
 def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:
     """Yield the missing segments: gaps in the numbers of the segments at `paths`."""
-    for (folder, name), files in groupby(paths, key=_run_of):
+    for (_, name), segments in groupby(paths, key=_run_of):
+        files = list(segments)
         numbers = [-1, *sorted(number_of(path)[1] for path in files)]
         for before, after in pairwise(numbers if len(numbers) > 2 else ()):
             if (count := after - before - 1) > 0:
-                first, last = (folder / name_of(f"{name}.mcap", number) for number in (before + 1, after - 1))
+                first, last = (
+                    files[0].with_name(name_of(f"{name}.mcap", number)) for number in (before + 1, after - 1)
+                )
                 yield MissingSegment(first, last, count)
 
 
 def _run_of(path: Path) -> tuple[Path, str]:
-    return path.parent, number_of(path)[0]
+    """Return the folder of a file's run, without links, and the run's name."""
+    return path.parent.resolve(), number_of(path)[0]
 
 
 def open_log(paths: Paths) -> Log:

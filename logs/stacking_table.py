@@ -50,10 +50,10 @@ class StackingTable(Table):
 
 
 def plain_table(columns: Sequence[str], rows: Iterable[Sequence[RenderableType]]) -> StackingTable:
-    """Return a table without lines; without `columns`, rows of a name and a value."""
+    """Return a table without lines; without `columns`, rows of a name and a value. Texts are no markup."""
     table = StackingTable(show_header=bool(columns), **PLAIN)
     for column in columns:
         table.add_column(Text(column))  # as markup, the unit in `decision [ms]` would be a style
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     return table

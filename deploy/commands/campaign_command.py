@@ -100,8 +100,7 @@ class CampaignCommand:
         cells = [self._prepared(robot, cell) for cell in cells]
         own = robot.task.name  # additional tasks of a robot have tables of their own
         path = self.results / f"{own}.json"
-        earlier = campaign.table_of(path)
-        campaign.check_addable(earlier, cells, path)
+        campaign.check_addable(campaign.table_of(path), cells, path)
         parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
         results = complete(parts, self.runs, self.runs, self.engine, self.again, say)
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
@@ -112,6 +111,7 @@ class CampaignCommand:
         ]
         driven = cells_of(parts, results, self.runs)
         new = {"cells": driven, "searches": worst_cases}
+        earlier = campaign.table_of(path)  # another campaign may have ended in the meantime
         table = {name: campaign.added(earlier[name], entries) for name, entries in new.items()}
         write_atomically(self.results / f"{own}.md", campaign.markdown(own, **table).encode())
         write_atomically(path, f"{json.dumps({'robot': own} | table, indent=1)}\n".encode())
@@ -119,7 +119,7 @@ class CampaignCommand:
             console.print(plain_table(*campaign.cell_table(driven)))
             if worst_cases:
                 console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(worst_cases)))
-            console.print(f"[dim]{self.results}: {own}.md, {own}.json[/]")
+            console.print(f"{self.results}: {own}.md, {own}.json", style="dim", markup=False)
         return {"robot": own} | new
 
     def _perturbations(self, dimensions: int) -> list[str]:

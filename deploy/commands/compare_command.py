@@ -238,5 +238,7 @@ class CompareCommand:
             text += "\n" + rows
         if not self.json:
             console.print(Markdown(text))
-            console.print(f"[dim]{folder}: table.md, table.json, curves.png, seeds.png, profiles.png[/]")
+            console.print(
+                f"{folder}: table.md, table.json, curves.png, seeds.png, profiles.png", style="dim", markup=False
+            )
         return plain(figures) | {"conservatism": others[0]["rows"] if others else None}

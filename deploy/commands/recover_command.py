@@ -21,7 +21,8 @@ class RecoverCommand:
     """Repair these log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays
     beside it as *.mcap.damaged."""
     out: Path | None = None
-    """Write the repaired log (of one file) here, and leave the damaged one as it is."""
+    """Write the repaired log of one file here, without the files that continue it, and leave the damaged one as it
+    is."""
     quiet: Quiet = False
     json: Json = False
 
@@ -30,9 +31,10 @@ class RecoverCommand:
         from brakeline.logs.log_recovery import recover
         from brakeline.logs.reader import find
 
-        paths = find(list(self.logs))
+        one_file = self.out is not None and len(self.logs) == 1 and self.logs[0].is_file()
+        paths = self.logs if one_file else find(self.logs)
         if self.out is not None and len(paths) > 1:
-            raise ValueError(f"--out takes one file, but the logs have {len(paths)}: name one file")
+            raise ValueError(f"--out takes one file, but the logs have {len(paths)}: name one .mcap file")
         recovered = []
         for path in paths:
             with under_way(f"reading {path}"):

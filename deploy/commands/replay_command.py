@@ -46,16 +46,19 @@ class ReplayCommand:
         from brakeline.deploy.run.replay_run import replay
         from brakeline.logs.reader import count_by_key, find
 
+        other_model = self.certificate is not None or self.data is not None
+        if self.mode != ReplayCommand.mode and not other_model:
+            raise ValueError("--mode belongs to another model set: give --certificate or --data too")
         values = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
         changes = {name: value for name, value in values.items() if value is not None}
-        if self.certificate or self.data:
+        if other_model:
             changes["mode"] = self.mode
-        replacement = self._replacement() if changes else None
+        replacement = self._replacement() if other_model else None
         counts = (count_by_key(path) for path in find(self.logs))
         total = sum(n for count in counts for key, n in count.items() if key.startswith("exchange/"))
         # The warnings of the filter were about the robots of that time.
         with under_way("deciding each request again", total) as advance, errors_only("brakeline.safety"):
-            result = replay(list(self.logs), replacement, advance)
+            result = replay(list(self.logs), replacement, advance, self.margin)
         figures = result.figures() | {"log": [str(path) for path in self.logs], "instead": changes}
         if self.json:
             print_json(figures)
@@ -65,7 +68,7 @@ class ReplayCommand:
         if not result.requests:
             errors.print("nothing was compared: no request could be read")
             return DIFFERENT
-        return DIFFERENT if replacement is None and result.different else 0
+        return DIFFERENT if result.different and not changes else 0
 
     def _replacement(self) -> Replacement:
         """Return the function that gives, for a robot, the filter to ask instead of the one that was in use."""
@@ -96,7 +99,7 @@ def print_comparison(figures: dict[str, Any]) -> None:
     compared = figures["requests"] - figures["unanswered"]
     changes = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
     heading = f"decided again with {changes}" if changes else "decided again"
-    console.print(f"{heading}: {compared} requests; {figures['unanswered']} had no answer")
+    console.print(f"{heading}: {compared} requests; {figures['unanswered']} had no answer", markup=False)
     console.print(f"identical in every bit: {share(figures['identical'], compared, digits=2)}")
     largest = f"; at most {figures['rounding']:.1g}" if figures["equal"] else ""
     equal = f"{share(figures['equal'], compared, digits=2)}{largest}"

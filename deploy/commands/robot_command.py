@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.markup import escape
 
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
 from brakeline.deploy.commands.common_options import Json, LogReadOptions, Unprefixed
@@ -108,12 +107,12 @@ class RobotCommand:
     def _show(self) -> int:
         robot = robot_named(self.file)
         values = summary(robot)
-        rows = [(escape(f"input {label}"), _input_text(one)) for label, one in values["inputs"].items()]
+        rows = [(f"input {label}", _input_text(one)) for label, one in values["inputs"].items()]
         for name, value in values.items():
             if name != "inputs":
                 text = "\n".join(value) if isinstance(value, list) else value
                 text = f"{text:g}" if isinstance(text, float) else str(text)
-                rows.append((escape(_label(name)), escape(text)))
+                rows.append((_label(name), text))
         print_result(self.json, values, plain_table((), rows))
         return 0
 

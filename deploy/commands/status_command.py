@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from rich.markup import escape
+from rich.text import Text
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import BusOptions, Json, Unprefixed
@@ -51,7 +51,11 @@ class StatusCommand:
             print_json({"alive": alive, "processes": processes, "learners": learners})
             return 0
         rows = [
-            (name, "[green]alive[/]" if name in alive else "[red]gone[/]", figures_text(processes.get(name, {})))
+            (
+                name,
+                Text("alive", "green") if name in alive else Text("gone", "red"),
+                figures_text(processes.get(name, {})),
+            )
             for name in sorted({*alive, *processes})
         ]
         console.print(plain_table(("process", "state", "figures"), rows))
@@ -68,4 +72,4 @@ class StatusCommand:
 def figures_text(values: dict[str, Any]) -> str:
     """Return the figures and notes of a process that are not zero or empty, without the counts of each channel."""
     shown = {name: value for name, value in values.items() if value and "/" not in name}
-    return escape(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in shown.items()))
+    return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in shown.items())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
@@ -15,6 +15,12 @@ from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, in_batches, load
 
+# Names of the options for fields that have another name, or that the command makes from several options.
+RESUMED = {
+    **{"robots": "the robots", "model_config": "--certificate or --mode", "conditions": "the simulated conditions"},
+    **{"learner": "--learner...", "robots_per_actor": "--robots-per-actor or --fleet", "change": "--change..."},
+    "rotation": "--rotation...",
+}
 STOPPED = 130  # exit status: the user stopped the run before its last step
 
 
@@ -74,8 +80,31 @@ class TrainCommand(RunConfig):
             from brakeline.deploy.run.processes import CONFIG
 
             resumed = load(self.resume / CONFIG)
+            self._check_resumed(resumed)
             from_logs = self.from_logs or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
+        return self._config_of_options()
+
+    def _check_resumed(self, resumed: RunConfig) -> None:
+        """Raise ValueError if options ask for another configuration than that of the resumed run, which stays."""
+        usual = replace(type(self).defaults([*self.robots]), steps=1)._config_of_options()
+        asked = replace(self, steps=1, from_logs=() if self.actors else self.from_logs or ("",))._config_of_options()
+        names = [item.name for item in fields(RunConfig) if item.name not in ("steps", "from_logs")]
+        ignored = [
+            RESUMED.get(name, f"--{name.replace('_', '-')}")
+            for name in names
+            if getattr(asked, name) not in (getattr(usual, name), getattr(resumed, name))
+        ]
+        if self.out is not None and self.out.resolve() != Path(str(self.resume)).resolve():
+            ignored.append("--out")
+        if ignored:
+            raise ValueError(
+                f"a resumed run goes on in its folder with its own configuration, but another one is asked for by "
+                f"{', '.join(ignored)}: leave that out. Only --steps and --from-logs can change"
+            )
+
+    def _config_of_options(self) -> RunConfig:
+        """Return the configuration of a new run. Raises ValueError if options contradict each other."""
         from brakeline.messaging.task import address
         from brakeline.safety.model.model_config import check_reservations
 
@@ -106,8 +135,12 @@ class TrainCommand(RunConfig):
 
     def run(self) -> int:
         """Run the training. Returns the exit status."""
-        folder = self.resume or self.out or dated_folder()
-        return train(self.config(), folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
+        from brakeline.logs.reader import find
+
+        folder, config = self.resume or self.out or dated_folder(), self.config()
+        if config.from_logs:
+            find(config.from_logs)  # a mistyped path ends the command before it starts a process
+        return train(config, folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
 
 
 def train(

@@ -204,6 +204,7 @@ def plain(value: Any) -> Any:
 
 PERCENT = ("goal rate", "collision rate", "interventions", CUT, *TOUCHED, *THIRDS)
 RARE = ("collision rate", *TOUCHED)  # shares near 0: with one decimal, an upper end of 0.15 % would read 0.1 %
+OF_SEEDS = ("steps to 90 % goals",)  # one number for each seed, not for each episode
 DIGITS = {
     "collisions": ".1f",
     "mean speed [m/s]": ".3g",
@@ -219,6 +220,8 @@ def written(name: str, value: Any) -> str:
         return "–"
     factor, unit = (100.0, " %") if name in PERCENT else (1.0, "")
     digits = ".2f" if name in RARE else ".1f" if name in PERCENT else DIGITS.get(name, ".0f")
+    if isinstance(value, MeanEstimate) and name in OF_SEEDS and len(value.seeds) == 1:
+        value = value.value  # one number has no interval
     if isinstance(value, MeanEstimate):
         middle, low, high = (f"{factor * v:{digits}}" for v in (value.value, value.low, value.high))
         return f"{middle}{unit} [{low}, {high}]"

@@ -43,21 +43,24 @@ class FeederSettings:
 class LoggedSteps:
     """The steps of a robot kind in logs that a learner can use, each once, in the order of the log.
 
+    A copy of a log in the same folder, such as one that `brakeline export --foxglove` wrote, adds nothing.
+
     The names of actors of the n-th run, from the second on, end in `.run<n>`. An actor that was started again and
     counted its episodes anew is another one, whose name has `.session<n>`. After the iteration `counts` has the numbers
-    of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values. `damage` has a line for
-    each part that could not be read.
+    of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values, and `reason` says what is
+    wrong with the first one. `damage` has a line for each part that could not be read.
     """
 
     logs: Sequence[str]
     robot: RobotWithTask
     counts: Counter[str] = field(default_factory=Counter)
     damage: list[str] = field(default_factory=list)
+    reason: str = ""
 
     def __iter__(self) -> Iterator[pb.Step]:
-        intake = StepReader(self.robot)
+        intake, known = StepReader(self.robot), set[tuple[str, int, int]]()
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
-            ledger, sessions = StepLedger(), _Sessions()
+            ledger, sessions, copied = StepLedger(), _Sessions(), dict[tuple[str, int], bool]()
             log_of_run = open_log(files)
             for record in log_of_run:
                 if record.topic != "step" or record.message.robot != self.robot.name:
@@ -65,8 +68,12 @@ class LoggedSteps:
                 step: pb.Step = record.message
                 try:
                     intake.move(step)
-                except BadStep:
+                except BadStep as error:
                     self.counts["unusable"] += 1
+                    self.reason = self.reason or str(error)
+                    continue
+                if _is_copied(step, copied, known):
+                    self.counts["duplicate"] += 1
                     continue
                 step.actor = sessions.name(step)
                 if not ledger.record(step.actor, step.episode, step.step, step.index):
@@ -77,6 +84,20 @@ class LoggedSteps:
                     step.actor = f"{step.actor}.run{number}"
                 yield step
             self.damage += log_of_run.damage.lines
+
+
+def _is_copied(step: pb.Step, copied: dict[tuple[str, int], bool], known: set[tuple[str, int, int]]) -> bool:
+    """Return whether an earlier log has the steps of this start of the actor. A folder may have a copy of a log.
+
+    Args:
+        copied: the starts in this log, and whether an earlier log has them; known: the first step of each start.
+    """
+    start = step.actor, step.header.run
+    if start not in copied:
+        first = (*start, step.header.wall_time)
+        copied[start] = step.header.wall_time > 0 and first in known
+        known.add(first)
+    return copied[start]
 
 
 class _Sessions:
@@ -103,13 +124,17 @@ def count(logs: Sequence[str], robot: RobotWithTask) -> int:
 
     Raises:
         LogError: a path is no log.
-        ValueError: the logs have no steps of this robot.
+        ValueError: the logs have no steps of this robot, or none that teaches anything.
     """
-    total = sum(1 for _ in LoggedSteps(logs, robot))
-    if not total:
+    steps, named = LoggedSteps(logs, robot), ", ".join(map(str, logs))
+    total = sum(1 for _ in steps)
+    if not total and (unusable := steps.counts["unusable"]):
         raise ValueError(
-            f"no steps of {robot.name} in {', '.join(map(str, logs))}: name a log that recorded this robot"
+            f"none of the {unusable} steps of {robot.name} in {named} can be learned from ({steps.reason}): name "
+            "the log of a run, whose steps have what the robot's task observes"
         )
+    if not total:
+        raise ValueError(f"no steps of {robot.name} in {named}: name a log that recorded this robot")
     return total
 
 
@@ -169,6 +194,8 @@ def _feed(process: Process, settings: FeederSettings) -> bool:
         figures["published"] += 1
     for line in steps.damage:
         log.warning("not learned from: %s", line)
+    if unusable := steps.counts["unusable"]:
+        log.warning("not learned from: %d unusable steps (%s)", unusable, steps.reason)
     log.info("published %d logged steps; the learner knew %d", figures["published"], figures["known"])
     deadline = time.monotonic() + (LAST_UPDATES_TIMEOUT if settings.alone else 0.0)
     while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):

@@ -56,6 +56,7 @@ class RecordedClient:
     obstacles of the requests (none with a scan alone). Rewards, goals and collisions are those of `record_outcome` and
     `reset`. Without these calls, `analyse` says that they are not recorded. A step is complete when the next request
     has the state after it, so the last decision of an episode has no step, and its outcome counts for the step before.
+    The only decision of an episode has a step with the state before it.
 
     >>> from brakeline import Filter, InProcess
     >>> with RecordedClient(InProcess(Filter.load("ground")), FOLDER / "mine") as safety:
@@ -94,6 +95,7 @@ class RecordedClient:
         self._began, self._episode, self._step, self._index = steady_time_ns(), 0, 0, 0
         self._pending: pb.Step | None = None  # of the current period: the state after it is not known yet
         self._complete: pb.Step | None = None  # the one before: it waits, since the episode may end with it
+        self._asked_at = 0.0  # time of the latest request [s]
         self._before: Array | None = None  # the state before the current period, if a request had it
         self._near = Shapes.of([], client.robot.position_dim)
         self._closed = threading.Event()
@@ -207,33 +209,42 @@ class RecordedClient:
 
     def _finish_step(self, request: pb.Request) -> None:
         """Complete the step of the last period with the state of a request, which is the state after it."""
-        step, self._pending = self._pending, None
+        step, self._pending, self._asked_at = self._pending, None, request.time
         if step is None:
             self._before = np.array(request.state)
             return
         self._put_complete()
         state, predicted = np.array(request.state), self.backup_plan.predicted
         d = self.robot.position_dim
-        self._index += 1
-        step.index = self._index
-        step.state.extend(request.state)
-        step.header.time = request.time
         if self._before is not None:
             step.speed = float(np.linalg.norm(state[:d] - self._before[:d])) / self.robot.period
-        distances = self._near.distance(state[:d])
-        step.clearance = step.closest = float(distances.min(initial=np.inf)) - self.robot.footprint
         if predicted is not None:
             step.compared, step.contained = True, predicted.contains(self.robot, state)
-        self._complete, self._before = step, state
+        self._complete_step(step, state, request.time)
+        self._before = state
+
+    def _complete_step(self, step: pb.Step, state: Array, time: float) -> None:
+        """Note the state at the end of a period. The step waits for the next one: the episode may end with it."""
+        self._index += 1
+        step.index = self._index
+        step.state.extend(state.tolist())
+        step.header.time = time
+        distances = self._near.distance(state[: self.robot.position_dim])
+        step.clearance = step.closest = float(distances.min(initial=np.inf)) - self.robot.footprint
+        self._complete = step
 
     def _end_episode(self, goal: bool = False, collision: bool = False) -> None:
         """Mark the last complete step as the episode's end. The period after it has no measured end, so no step."""
-        if self._complete is not None:
-            if (last := self._pending) is not None:
-                self._complete.reward += last.reward
+        last = self._pending
+        if self._complete is None and last is not None and self._before is not None:
+            self._complete_step(last, self._before, self._asked_at)  # the only period: else its outcome would be lost
+        if (end := self._complete) is not None:
+            if last is not None:
+                end.reward += last.reward if last is not end else 0.0
                 goal, collision = goal or last.goal, collision or last.collision
-            self._complete.goal, self._complete.collision = goal, collision
-            self._complete.terminated, self._complete.truncated = goal or collision, not (goal or collision)
+            end.goal, end.collision = goal, collision or end.collision
+            end.terminated = end.goal or end.collision
+            end.truncated = not end.terminated
         self._put_complete()
         self._episode += bool(self._step)
         self._pending, self._before, self._step = None, None, 0

@@ -28,7 +28,9 @@ from brakeline.logs.reader import Damage, Log, Paths, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.methods import Method, decode, load, ready
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.methods import Method, Model, decode, load, ready
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.server import ModelRegistry
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
@@ -40,34 +42,47 @@ ROUNDING = 1e-12  # largest difference of equal numbers, relative to the number 
 EXAMPLES = 20  # differences that the figures list, the largest ones
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
-Waiting = dict[tuple[tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]  # incomplete fleet requests
+# Incomplete requests of a fleet, by the start of its process, its robots, episode and step.
+Waiting = dict[tuple[int, tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]
 Replacement = Callable[[Robot], Method]  # gives the filter for a robot instead of the one in use
 
 
 @dataclass
 class Archive:
-    """The methods that were in use, by version: from the log, else from the run's folder, else from the data folder."""
+    """The methods that were in use, by version: from the log, else from the run's folder, else from the data folder.
+
+    Attributes:
+        margin: clearance margin of these methods instead of their own [m].
+    """
 
     log: Log
+    margin: float | None = None
     methods: dict[str, Method] = field(default_factory=dict)
 
     def add(self, file: bytes) -> None:
-        """Add a model that was published during the recording. Raises BadModel."""
-        method = ready(decode(file))
+        """Add a model that was published during the recording. Raises BadModel, LogError."""
+        method = self._ready(decode(file))
         self.methods.setdefault(method.version, method)
 
     def method(self, robot: str, version: str) -> Method:
         """Return the method that was in use.
 
         Raises:
-            LogError: its model is nowhere.
+            LogError: its model is nowhere, or has no clearance margin to replace.
             BadModel: its file is damaged or has another layout.
         """
         if version not in self.methods:
-            self.methods[version] = ready(self._model(robot, version))
+            self.methods[version] = self._ready(self._model(robot, version))
         return self.methods[version]
 
-    def _model(self, robot: str, version: str) -> Any:
+    def _ready(self, model: Model) -> Method:
+        if self.margin is None:
+            return ready(model)
+        if not isinstance(model, ModelSet):
+            raise LogError(f"method {model.method} has no clearance margin: leave out --margin")
+        return Filter(model, self.margin)
+
+    def _model(self, robot: str, version: str) -> Model:
         attached = self.log.attachments.get(model_attachment_name(robot, version))
         if attached is not None:
             return decode(attached)
@@ -202,20 +217,26 @@ def _difference(one: Any, other: Any) -> Difference:
     return Difference(float(gap.max(initial=0.0)), bool((gap <= ROUNDING * np.maximum(np.abs(first), 1.0)).all()))
 
 
-def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[], Any] = lambda: None) -> Comparison:
+def replay(
+    paths: Paths,
+    instead: Replacement | None = None,
+    advance: Callable[[], Any] = lambda: None,
+    margin: float | None = None,
+) -> Comparison:
     """Ask for each decision of a log again.
 
     Args:
         paths: files or run folders of the log.
         instead: gives the filter to ask instead of the one in use. It accepts the committed plans of the log.
         advance: is called after each request.
+        margin: clearance margin of the model sets that were in use, instead of their own [m].
 
     Raises:
-        LogError: the paths are no log.
+        LogError: the paths are no log, or a method that was in use has no clearance margin.
         LogError, BadModel: a model that was in use is missing or damaged.
     """
     log = open_log(paths)
-    archive, models, result = Archive(log), ModelRegistry(), Comparison()
+    archive, models, result = Archive(log, margin), ModelRegistry(), Comparison()
     ask, waiting = asking(models), Waiting()
     for record in log:
         if record.topic == "model":
@@ -228,7 +249,7 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
         if _from_before_known_free(request, logged):
             request.known_free = True
         advance()
-        joint = _joint_requests(waiting, request, logged)
+        joint = _joint_requests(waiting, record.message)
         if any(reply.WhichOneof("result") is None for _, reply in joint):
             result.requests += len(joint)
             result.unanswered += len(joint)
@@ -247,6 +268,10 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
         for (request, logged), reply in zip(joint, replies, strict=True):
             result.add(request, logged, reply, () if instead is None else ("model",))
     result.damage = log.damage
+    if alone := sum(map(len, waiting.values())):
+        result.damage.cuts.append(
+            f"{alone} requests of a fleet are not compared: those of its other robots are missing"
+        )
     return result
 
 
@@ -259,11 +284,12 @@ def _from_before_known_free(request: pb.Request, logged: pb.Reply) -> bool:
     return not described and logged.error.field != "obstacles"
 
 
-def _joint_requests(waiting: Waiting, request: pb.Request, logged: pb.Reply) -> list[tuple[pb.Request, pb.Reply]]:
+def _joint_requests(waiting: Waiting, exchange: pb.Exchange) -> list[tuple[pb.Request, pb.Reply]]:
     """Return the requests that were sent together: one, or those of all robots of a fleet once the last one is read."""
+    request, logged = exchange.request, exchange.reply
     if not request.fleet:
         return [(request, logged)]
-    key = tuple(request.fleet), request.episode, request.step
+    key = exchange.header.run, tuple(request.fleet), request.episode, request.step
     group = waiting.setdefault(key, {})
     group[request.actor] = request, logged
     if group.keys() != set(request.fleet):

@@ -30,9 +30,12 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     if not (figures["steps"] or figures.get("from_logs") or figures["learners"]):
         return [f"ended before the first step; nothing was driven, see {figures['folder']}/logs if you did not end it"]
     lines = [_outcome(figures), _answers(figures)] if figures["steps"] else []
+    if figures.get("resumed") and figures["finished"] and not (figures["steps"] or figures.get("from_logs")):
+        lines.append("nothing was driven: the run had all its steps already. To go on, give more --steps")
     if fed := figures.get("from_logs"):
         lines.append(
             f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner had already"
+            + (f"; {fed['unusable']} are unusable, see {figures['folder']}/logs" if fed.get("unusable") else "")
         )
     if not figures["log"]:
         lines.append(f"no log was recorded; policies: {', '.join(figures['policies']) or 'none'}")

@@ -101,12 +101,12 @@ class Picker {
 
   /** Show the facts of the episode and of its point `k`. */
   tell(k) {
-    const e = this.episode, step = stepOf(e, k);
+    const e = this.episode, step = stepOf(e, k), all = e.at || e.x.length === e.steps;
     const facts = {
       actor: e.actor, episode: e.episode, arena: e.arena ?? "not in the log", outcome: e.outcome, steps: e.steps, reward: figure(e.reward, 4),
-      interventions: `${e.interventions}, ${e.failsafes} of them failsafe`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${stepOf(e, e.closest_at)}`,
+      interventions: `${e.interventions}, ${e.failsafes} of them failsafe`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm${all ? ` at step ${stepOf(e, e.closest_at)}` : ""}`,
       step, position: `${[e.x[k], e.y[k], ...(e.z ? [e.z[k]] : [])].map((v) => figure(v)).join(", ")} m`, ...(e.speed ? { speed: `${figure(e.speed[k])} m/s` } : {}), clearance: `${figure(100 * e.clearance[k])} cm`, decision: why(e, k),
-      ...(e.at ? { "in short": `this page has ${e.at.length} of the steps; for all of them, run brakeline analyse with --html and --episode ${e.episode}` } : {}),
+      ...(e.at || !all ? { "in short": `this page has ${e.at ? e.at.length : `the first ${e.x.length}`} of the steps; for all of them, run brakeline analyse with --html and --episode ${e.episode}` } : {}),
     };
     this.facts.replaceChildren(...Object.entries(facts).flatMap(([name, value]) => [element("dt", {}, name), element("dd", { "data-fact": name }, String(value))]));
     this.onshow(e, step);

@@ -34,7 +34,12 @@ def episode(driver: EpisodeRunner, policy: Policy, ask: Ask | None, number: int)
 
 
 def drive(
-    log: Path, steps: int = 150, change: Change | None = None, attach: bool = True, actor: str = "actor-0"
+    log: Path,
+    steps: int = 150,
+    change: Change | None = None,
+    attach: bool = True,
+    actor: str = "actor-0",
+    run: int = 1,
 ) -> str:
     """Drive and record; `change` may falsify what is recorded of an exchange. Returns the model set's version."""
     model = model_for(GROUND, ModelConfig())
@@ -48,7 +53,7 @@ def drive(
         key = topic.at(robot="ground", source=actor)
         number = next(numbers.setdefault(key, count(1)))
         now = time.time_ns()
-        message.header.MergeFrom(pb.Header(sequence=number, source=actor, run=1, wall_time=now))
+        message.header.MergeFrom(pb.Header(sequence=number, source=actor, run=run, wall_time=now))
         segment.save([entry(Sample(topic, key, message.SerializeToString(), now))])
 
     policy, episode = scripted("greedy", GROUND, np.random.default_rng(0)), 0

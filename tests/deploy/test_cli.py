@@ -56,6 +56,7 @@ STATED = {
         ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "there are: crossing, default"),
         ("train ground --arena ballroom --out {folder}/run", "no arena is called 'ballroom'; there are: crossing"),
         ("train submarine --out {folder}/run", "no robot is called 'submarine'; there are: ground"),
+        ("train ground --from-logs {folder}/none --out {folder}/run", "no log at"),
         ("train ground --resume {folder}/none", "is no run's configuration"),
         ("train ground --deterministic --robots-per-actor 2", "one actor with one robot"),
         ("train ground --actors 0", "1 or more"),

@@ -46,6 +46,15 @@ def test_csv_has_every_step_with_every_field(log, tmp_path, figures) -> None:
     assert missing == {"path"}
 
 
+@pytest.mark.parametrize("words", [("export", "--csv"), ("export", "--tlog"), ("analyse", "--html")])
+def test_no_file_is_written_over_a_log(log, words, tmp_path, command) -> None:
+    """`brakeline export --csv run.mcap` means a log, not a file to write."""
+    (mine := tmp_path / "run.mcap").write_bytes(log.read_bytes())
+    status, _, err = command(*words, mine, log)
+    assert status == 1 and "is a log, and is not overwritten" in err
+    assert mine.read_bytes() == log.read_bytes()
+
+
 def test_minari_loads_the_episodes(log, tmp_path, monkeypatch, command, figures) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

@@ -144,7 +144,8 @@ def test_a_changed_input_never_stands_beside_a_bare_allowed(proposed, before, ex
     assert explain(QUADROTOR, request, decision).limited == limited
     assert decision_view(QUADROTOR, exchange).explanation_json()["limited"] == limited
     step = pb.Step(state=request.state, proposed=proposed, action=executed, decision=pb.ALLOWED)
-    episode = EpisodeRecord("", 0, None, [step], actor_exchanges=[exchange])
+    episode = EpisodeRecord("", 0, None, actor_exchanges=[exchange])
+    episode.add(step)
     (row,) = rows(episode, QUADROTOR)
     assert row["limited"] == limited
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from brakeline.logs.episode_sampler import SPREAD
+from brakeline.logs.episode_sampler import MOST_STEPS, SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve, interventions_in
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
@@ -81,6 +81,8 @@ def test_training_rates_are_those_of_the_steps_in_each_bin(figures: dict[str, An
         assert row["episodes"] == sum(s.terminated or s.truncated for s in own)
         assert row["closest"] == min(map(least_clearance, own))
     assert training["bins"][-1]["until"] == len(steps)
+    collisions = sum(row["collisions"] for row in training["bins"])
+    assert collisions == figures["robots"]["ground"]["collisions"], "also of an episode whose end is lost"
     ended = [step for step in steps if step.terminated or step.truncated]
     last = training["last"]
     assert last["episodes"] == min(100, len(ended)) > 20
@@ -127,6 +129,13 @@ def test_runs_are_labelled_and_merged(two: Two) -> None:
     assert (both["seed"], both["metadata"]["run"]) == (7, ABOUT["run"])
     messages = [run["messages"] for figures in single for run in figures["runs"].values()]
     assert [run["messages"] for run in both["runs"].values()] == messages
+
+
+def test_an_actor_is_found_in_several_runs_with_and_without_the_run_in_its_name(tmp_path: Path) -> None:
+    folders = [mixed(tmp_path / "one", 5, 8), mixed(tmp_path / "two", 6, 8)]
+    for actor, found in (("actor-1", ["one/actor-1", "two/actor-1"]), ("two/actor-1", ["two/actor-1"])):
+        detail = analyse_runs(folders, AnalysisOptions(episode=3, actor=actor)).figures()["episode_detail"]
+        assert [episode["actor"] for episode in detail] == found
 
 
 def test_a_process_of_an_earlier_run_is_not_silent_in_a_later_one(two: Two) -> None:
@@ -207,6 +216,30 @@ def test_the_table_of_an_episode_has_the_recorded_values(
     assert " ".join(f"{value:.2f}" for value in drone["rows"][0]["state"][:3]) in printed(show_episode(drone), 200)
 
 
+def test_a_long_episode_is_told_to_its_end(tmp_path: Path) -> None:
+    """Ten minutes and more of one robot's driving: its program may never end an episode. One actor starts twice."""
+    writer, length = Writer(losses=0.0), MOST_STEPS + 40
+    for run, steps in ((1, 5), (2, length)):
+        for k in range(steps):
+            step = writer._step("actor-0", 7, k, "ground", 1)
+            step.reward, step.closest = 1.0, 0.5 - 0.1 * (k == length - 3)
+            step.collision = step.terminated = run == 2 and k == length - 1
+            writer.put("exchange/ground/actor-0", writer._exchange(step, 2), run)
+            writer.put("step/ground/actor-0", step, run)
+    writer.write(tmp_path / "run.mcap")
+    figures = analyse_runs(tmp_path, AnalysisOptions(episode=7)).figures()
+    cut, long = figures["episode_detail"]
+    assert cut["outcome"] == "unfinished" and len(cut["rows"]) == 5
+    assert (long["outcome"], long["steps"], long["reward"]) == ("collision", length, length)
+    assert len(long["rows"]) == length and long["rows"][-1]["end"] == "collision"
+    assert long["closest"] == pytest.approx(0.4) and long["closest_at"] == length - 3
+    assert all(row["round_trip_ms"] is not None for row in (*cut["rows"], *long["rows"]))
+    (_, pictures) = analyse_runs(tmp_path, AnalysisOptions(pictures=True)).by_label()[tmp_path.name]
+    drawn = pictures["galleries"]["ground"]["episodes"][-1]
+    assert (drawn["outcome"], drawn["steps"], len(drawn["x"])) == ("collision", length, MOST_STEPS)
+    assert drawn["interventions"] == figures["interventions"] - cut["interventions"]
+
+
 def test_the_nearest_misses_are_the_nearest(analysis: LogAnalysis, messages: Messages) -> None:
     pictures = analysis.by_label()["mixed"][1]
     closest: dict[tuple[str, int, int], float] = {}
@@ -266,13 +299,15 @@ def test_bins_become_wider_instead_of_more() -> None:
     assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
 
 
-def test_curves_count_the_interventions_that_the_summary_counts() -> None:
+def test_curves_count_the_interventions_and_collisions_that_the_summary_counts() -> None:
+    """A program of your own may drive on after a collision."""
     curve, kinds = LearningCurve(), [pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING, pb.RECOVERING]
     for k, kind in enumerate(kinds):
-        curve.step(pb.Step(actor="a", step=k, decision=kind, truncated=k == 4))
+        curve.step(pb.Step(actor="a", step=k, decision=kind, truncated=k == 4, collision=k in (1, 2)))
     figures = curve.figures()
     (row,) = figures["bins"]
     assert interventions_in(row) == pytest.approx(figures["last"]["interventions"]) == 0.8
+    assert row["collisions"] == figures["last"]["collisions"] == 1
     before = {name: value for name, value in row.items() if name != "recovering"}
     assert interventions_in(before) == pytest.approx(0.4), "a row that an earlier version wrote"
 

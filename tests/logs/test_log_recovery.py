@@ -116,6 +116,11 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     path.write_bytes(path.read_bytes()[:-100])
     assert main(["recover", str(path), "--out", str(tmp_path / "out.mcap")]) == 0
     assert open_log(path).cuts == [] and list(open_log(path)) and open_log(tmp_path / "out.mcap")
+    assert main(["recover", str(tmp_path / "run.mcap"), "--out", str(tmp_path / "first.mcap")]) == 0, "this file alone"
+    said = capsys.readouterr().out
+    assert "a copy of" in said and "run.mcap, which is intact" in said and "damaged file is" in said.splitlines()[0]
+    assert len(list(open_log(tmp_path / "first.mcap"))) == len(list(Log((tmp_path / "run.mcap",))))
+    (tmp_path / "first.mcap").unlink()
     assert main(["recover", str(tmp_path / "run.mcap"), "--json"]) == 0
     lines = capsys.readouterr().out.splitlines()
     files = json.loads(lines[-1])["files"]

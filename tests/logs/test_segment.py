@@ -91,6 +91,24 @@ def test_logs_named_by_date_are_runs_of_their_own(tmp_path: Path, say: Say) -> N
     assert [str(cut).removeprefix(f"{tmp_path}/") for cut in log.cuts] == missing
 
 
+def test_a_file_counts_once_and_in_its_place_whatever_the_order_and_the_links(tmp_path: Path, say: Say) -> None:
+    """`runs/*` also has the newest run as `runs/latest`."""
+    for run in ("a", "b"):
+        (tmp_path / run).mkdir()
+        for _ in range(2):
+            write(tmp_path / run / "run.mcap", [say("log/a", pb.LogLine(text=run))])
+    (tmp_path / "latest").symlink_to("b")
+    files = {"a": ["run.mcap", "run_0001.mcap"], "b": ["run.mcap", "run_0001.mcap"]}
+    for given in (
+        sorted(tmp_path.iterdir()),
+        [tmp_path / "a", tmp_path / "b" / ".." / "b", tmp_path / "b"],
+        [tmp_path / "a" / "run_0001.mcap", tmp_path / "latest" / "run_0001.mcap", tmp_path / "b", tmp_path / "a"],
+    ):
+        runs = by_run(find(given))
+        assert {label: [path.name for path in paths] for label, paths in runs.items()} == files, given
+        assert len(list(read(given))) == 4
+
+
 def test_a_truncated_file_yields_its_intact_messages_and_reports_the_damage(tmp_path: Path, say: Say) -> None:
     run = tmp_path / "run.mcap"
     segment, ends = open_segment(run, {}), []

@@ -29,3 +29,11 @@ def test_a_table_has_its_full_width_in_a_file_and_is_stacked_where_less_is_allow
 def test_the_units_of_columns_are_shown(width):
     text = printed(plain_table(("decision [ms]", "speed [m/s]"), [("1.2", "0.25")]), width)
     assert "decision [ms]" in text and "speed [m/s]" in text
+
+
+@pytest.mark.parametrize("width", [None, 20])
+def test_texts_are_no_markup(width):
+    """A run may be called `no[filter]`, and a reason of another program may hold anything."""
+    cells = "no[filter]", "[/]", ":fire:", "[red]x"
+    text = printed(plain_table(tuple("abcd"), [cells]), width)
+    assert all(cell in text for cell in cells)

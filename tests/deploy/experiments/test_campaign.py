@@ -195,6 +195,24 @@ def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has
         command.run()
 
 
+def test_a_table_keeps_the_cells_of_a_campaign_that_ended_meanwhile(driven, monkeypatch, tmp_path):
+    _, (first, _), _ = driven
+    settings = {"engine": IN_THIS_PROCESS, "results": tmp_path, "quiet": True}
+    command = CampaignCommand(
+        arenas=("dense",), policies=("random",), model_sets=("residual",), episodes=4, runs=tmp_path / "1", **settings
+    )
+
+    def complete(jobs, _, runs, *__):
+        if jobs and runs == tmp_path / "1":
+            replace(command, arenas=("default",), runs=tmp_path / "2").run()
+        return [first] if jobs else []
+
+    monkeypatch.setattr(experiment_jobs, "complete", complete)
+    command.run()
+    cells = json.loads((tmp_path / "ground.json").read_text())["cells"]
+    assert [cell["arena"] for cell in cells] == ["default", "dense"]
+
+
 def test_an_episode_that_touches_a_wall_and_a_walker_is_one_collision():
     both = {name: [value] for name, value in (ROW | {"collision": 1, "contact_moving": 1}).items()}
     (cell,) = cells_of([CELL], [{"episodes": both, "near": []}], Path("runs"))

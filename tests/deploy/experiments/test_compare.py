@@ -294,6 +294,13 @@ def test_a_ratio_is_of_sums_and_of_seeds_alike():
         mean([[]])
 
 
+def test_the_steps_of_one_training_have_no_interval():
+    """An interval without a width would claim that each other seed needs as many steps."""
+    assert written("steps to 90 % goals", mean([[4000.0]])) == "4000"
+    assert "[" in written("steps to 90 % goals", mean([[4000.0], [5000.0]]))
+    assert written("mean reward", mean([[4.0, 4.0]])) == "4 [4, 4]"
+
+
 def test_steps_of_several_actors_are_rows_in_the_order_in_which_their_episodes_began():
     table = EpisodeTable()
     for actor, ended in (("slow", False), ("fast", False), ("fast", True), ("slow", False), ("fast", True)):

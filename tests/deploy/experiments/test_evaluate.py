@@ -81,16 +81,18 @@ def test_a_fleet_of_planners_gets_past_each_other(data_folder):
 
 
 def test_what_was_one_question_is_asked_again_as_one():
-    def one(actor, step):
-        return pb.Request(actor=actor, step=step, fleet=["a", "b"]), pb.Reply()
+    def one(actor, step, run=1):
+        request = pb.Request(actor=actor, step=step, fleet=["a", "b"])
+        return pb.Exchange(header=pb.Header(run=run), request=request, reply=pb.Reply())
 
     waiting = {}
-    assert _joint_requests(waiting, *one("b", 1)) == [] == _joint_requests(waiting, *one("a", 2))
-    asked = _joint_requests(waiting, *one("a", 1))
+    assert _joint_requests(waiting, one("b", 1)) == [] == _joint_requests(waiting, one("a", 2))
+    asked = _joint_requests(waiting, one("a", 1))
     assert [request.actor for request, _ in asked] == ["a", "b"] and {request.step for request, _ in asked} == {1}
-    assert len(_joint_requests(waiting, *one("b", 2))) == 2 and not waiting
-    alone = pb.Request(actor="a"), pb.Reply()
-    assert _joint_requests(waiting, *alone) == [alone]
+    assert _joint_requests(waiting, one("b", 2, run=2)) == [], "of another start of the process"
+    assert len(_joint_requests(waiting, one("b", 2))) == 2 and len(waiting) == 1
+    alone = pb.Exchange(request=pb.Request(actor="a"), reply=pb.Reply())
+    assert _joint_requests(waiting, alone) == [(alone.request, alone.reply)]
 
 
 @pytest.mark.parametrize("change", [{"episodes": 0}, {"seed": -1}, {"fleet": -2}])

@@ -120,6 +120,9 @@ def test_a_resumed_run_and_an_untrained_policy_are_named_as_such(view: Launcher)
     figures = ended(view, finished=True, resumed=True)
     assert rows_of(figures)[0].startswith("since the resumption: 97 of the last 100 episodes")
     assert not any("learned nothing" in row for row in rows_of(figures))
+    fed = {"logs": ["runs/mine"], "published": 0, "known": 0, "unusable": 7}
+    assert any("; 7 are unusable, see" in row for row in rows_of(figures | {"from_logs": fed}))
+    assert rows_of(figures | {"steps": 0})[0].startswith("nothing was driven: the run had all its steps already.")
     learner = {"steps": 100, "updates": 0}
     (untrained,) = [row for row in rows_of(figures | {"learners": {"ground": learner}}) if "learned nothing" in row]
     assert untrained.startswith("the policy of ground has learned nothing: the run ended within the warm-up")

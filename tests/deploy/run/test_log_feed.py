@@ -41,6 +41,10 @@ def test_unusable_steps_are_counted_and_left_out(tmp_path: Path) -> None:
     steps = LoggedSteps([str(tmp_path)], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 4)]
     assert steps.counts == {"taken": 2, "unusable": 2}  # the reader has passed over the reward that is no number
+    (tmp_path / "own").mkdir()
+    record(tmp_path / "own" / "run.mcap", *bad)
+    with pytest.raises(ValueError, match=r"none of the 2 steps of ground .* \(observation: 1 values, not 26\)"):
+        count([str(tmp_path / "own")], GROUND)
 
 
 def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: Path) -> None:
@@ -53,6 +57,15 @@ def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: 
     assert count([str(tmp_path / "one"), str(tmp_path / "two")], GROUND) == 5
     with pytest.raises(ValueError, match="no steps of quadrotor"):
         count([str(tmp_path / "one")], QUADROTOR)
+
+
+def test_a_copy_of_a_log_in_its_folder_teaches_nothing_twice(tmp_path: Path) -> None:
+    for run in (1, 2):
+        steps = [step(i, header=pb.Header(run=run, wall_time=10**9 * run + i)) for i in range(3)]
+        record(tmp_path / "run.mcap", *steps)  # of another start in run_0001.mcap
+    shutil.copy(tmp_path / "run.mcap", tmp_path / "pictures.mcap")
+    steps_of_folder = LoggedSteps([str(tmp_path)], GROUND)
+    assert len(names(steps_of_folder)) == 6 and steps_of_folder.counts == {"taken": 6, "duplicate": 3}
 
 
 def test_two_sessions_of_an_actor_in_one_log_are_two_actors_and_a_restart_is_one(tmp_path: Path) -> None:

@@ -86,6 +86,30 @@ def test_the_log_has_every_request_and_the_step_to_the_next_one(method, tmp_path
     assert (again["requests"], again["identical"] + again["equal"]) == (2 * PERIODS, 2 * PERIODS)
 
 
+def test_no_stated_collision_is_lost(method, tmp_path, figures) -> None:
+    """Neither that of an episode with one decision, also without an answer, nor that of the last period but one."""
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        drive(safety, 1)
+        safety.record_outcome(-1.0, collision=True)
+        safety.reset()
+        with pytest.raises(BadRequest):
+            safety.decide([0.0] * 5, [0.2, 0.0])  # nothing is said of the space around
+        safety.fallback()
+        safety.reset(collision=True)
+        drive(safety, 2)
+        safety.record_outcome(-1.0, collision=True)
+        drive(safety, 1)
+        safety.reset()
+        drive(safety, 1)
+        safety.record_outcome(2.0, goal=True)
+    counted = figures("analyse", safety.path)
+    assert (counted["episodes"], counted["collisions"], counted["goals"], counted["steps"]) == (4, 3, 1, 5)
+    assert counted["mean_reward"] == (-1.0 + 0.0 - 1.0 + 2.0) / 4
+    first = messages(safety.path, "step")[0]
+    assert first.state == [0.0] * 5 and first.speed == 0.0 and not first.compared
+    assert first.clearance == pytest.approx(0.5 - method.robot.footprint)
+
+
 def test_the_log_says_when_a_state_left_its_predicted_set(method, tmp_path) -> None:
     with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
         for x in (0.0, 0.001, 0.0, 0.3, 0.301, 0.3):  # it stands, and its position jumps once

@@ -37,11 +37,19 @@ def test_the_same_version_decides_the_same(log: Path, figures) -> None:
     assert same["fields"] == {} and same["examples"] == [] and same["same_input"] == STEPS
 
 
-def test_a_log_suffices_for_a_replay(log, tmp_path, monkeypatch, figures) -> None:
+def test_a_log_suffices_for_a_replay_also_with_another_margin(log, tmp_path, monkeypatch, figures) -> None:
+    """The model set in use on this machine is another one than that in the log."""
+    margin = Filter(model_for(GROUND, ModelConfig())).clearance_margin
     shutil.copy(log, tmp_path / "elsewhere.mcap")
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
-    again = figures("replay", tmp_path / "elsewhere.mcap")
-    assert again["identical"] + again["equal"] == STEPS
+    for changes in ((), ("--margin", margin)):
+        again = figures("replay", tmp_path / "elsewhere.mcap", *changes)
+        assert again["identical"] + again["equal"] == STEPS, changes
+
+
+def test_a_mode_alone_is_refused(log, command) -> None:
+    status, _, err = command("replay", log, "--mode", "one-step")
+    assert status == 1 and "give --certificate or --data too" in err
 
 
 def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(data_folder, tmp_path, monkeypatch) -> None:
@@ -132,6 +140,20 @@ def test_a_replay_says_what_it_could_not_read(damaged: Path, tmp_path: Path, com
     (tmp_path / "empty.mcap").touch()
     status, _, err = command("replay", tmp_path / "empty.mcap")
     assert status == 1 and "no request could be read" in err
+
+
+def test_a_replay_says_which_requests_of_a_fleet_it_could_not_decide_again(data_folder: Path, tmp_path: Path) -> None:
+    """Those of the other robots are not in the log, or were sent by another start of the process."""
+
+    def together(exchange: pb.Exchange) -> None:
+        if exchange.request.step < 3:
+            exchange.request.fleet[:] = ["actor-0", "actor-1"]
+
+    drive(tmp_path / "a" / "run.mcap", 8, together)
+    drive(tmp_path / "b" / "run.mcap", 8, together, actor="actor-1", run=2)
+    replayed = replay([tmp_path / "a", tmp_path / "b"])
+    assert (replayed.requests, replayed.different) == (10, 0)
+    assert any("6 requests of a fleet are not compared" in line for line in replayed.damage.lines)
 
 
 def test_a_log_that_begins_after_a_change_of_models_has_no_stale_models(data_folder: Path, tmp_path: Path) -> None:

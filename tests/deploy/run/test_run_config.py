@@ -4,11 +4,13 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from brakeline.actors.actor_settings import PhysicsChange
+from brakeline.deploy.commands.common_options import ServiceOptions
 from brakeline.deploy.commands.fly_command import FlyCommand
 from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
@@ -123,8 +125,27 @@ def test_the_options_start_from_the_experiment(tmp_path: Path) -> None:
 
 def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(encode(CHANGED))
-    assert TrainCommand(resume=tmp_path, arena="open").config() == CHANGED
-    assert TrainCommand(resume=tmp_path, steps=5).config() == replace(CHANGED, steps=5)
+    resume = replace(TrainCommand.defaults(["ground"]), resume=tmp_path)
+    assert resume.config() == CHANGED
+    assert replace(resume, steps=5).config() == replace(CHANGED, steps=5)
+    assert replace(resume, arena="dense", deadline=0.25, out=tmp_path, actors=2).config() == CHANGED, "the same again"
+    assert replace(resume, from_logs=("log",)).config() == replace(CHANGED, from_logs=("log",))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"arena": "open", "seed": 3}, "--arena, --seed"),
+        ({"out": Path("elsewhere")}, "--out"),
+        ({"filtering": ServiceOptions(mode="one-step")}, "--certificate or --mode"),
+        ({"actors": 0}, "--actors"),
+    ],
+)
+def test_a_resumed_run_refuses_what_it_would_ignore(options: dict[str, Any], said: str, tmp_path: Path) -> None:
+    """With `--out` it would go on in the old folder, which one may want to keep."""
+    (tmp_path / "config.json").write_text(encode(CHANGED))
+    with pytest.raises(ValueError, match=f"asked for by {said}: leave that out"):
+        replace(TrainCommand.defaults(["ground"]), resume=tmp_path, **options).config()
 
 
 def test_an_impossible_world_is_refused_before_anything_starts() -> None:
