@@ -22,6 +22,7 @@ from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
 from brakeline.safety.filter.widening import PastWindow
 
+FLOAT = np.dtype(float)
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
 FEW = 64  # numbers, up to which a loop is faster than NumPy
@@ -252,7 +253,7 @@ def _check_arrays(robot: Robot, shapes: Shapes) -> None:
     sizes = {"center": (n, d), "axes": (n, d, d), "half": (n, d), "rho": (n,), "round": (n, d), "margin": (n,)}
     for name, size in sizes.items():
         part = getattr(shapes, name)
-        if part.shape != size or part.dtype != float or not part.flags.writeable:
+        if part.shape != size or part.dtype is not FLOAT or not part.flags.writeable:
             found = f"shape {part.shape} and type {part.dtype}{'' if part.flags.writeable else ', read-only'}"
             why = f"obstacles.{name} has {found}; {n} obstacles need {size} and float64, writable: use Shapes.of"
             raise BadRequest("obstacles", why)

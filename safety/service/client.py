@@ -89,12 +89,16 @@ def request_message(
 
 def _set_labels(message: pb.Request, **labels: Any) -> None:
     """Set the fields that name a request, for the log and for plan tokens. Raises BadRequest for another type."""
-    for name, value in labels.items():
-        try:
-            message.MergeFrom(pb.Request(**{name: value}))
-        except (TypeError, ValueError) as error:
-            give = "give texts as actor and fleet, whole numbers from 0 as episode and step, and seconds as time"
-            raise BadRequest(name, f"{name} is {value!r:.80}: {give}") from error
+    name = ""
+    try:
+        for name, value in labels.items():
+            if name == "fleet":
+                message.fleet.extend(value)
+            else:
+                setattr(message, name, value)
+    except (AttributeError, TypeError, ValueError) as error:
+        give = "give texts as actor and fleet, whole numbers from 0 as episode and step, and seconds as time"
+        raise BadRequest(name, f"{name} is {labels[name]!r:.80}: {give}") from error
 
 
 def _set_history(message: pb.Request, backup_plan: BackupPlan) -> None:
