@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from shlex import quote
 from typing import Any
 
 from brakeline.messaging import brakeline_pb2 as pb
@@ -40,12 +41,14 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     if not figures["log"]:
         lines.append(f"no log was recorded; policies: {', '.join(figures['policies']) or 'none'}")
     else:
-        lines.append(f"next: brakeline analyse {figures['folder']} --html report.html")
+        lines.append(f"next: brakeline analyse {quote(figures['folder'])} --html report.html")
     if refused := figures.get("refused"):
         lines.append(f"{refused} steps do not count: repeated, or not permitted by the learner")
     lines += _untrained(figures)
     if not figures["finished"] and figures.get("policy") in (None, "learning"):
-        lines.append(f"stopped before the last step; continue with: brakeline train --resume {figures['folder']}")
+        lines.append(
+            f"stopped before the last step; continue with: brakeline train --resume {quote(figures['folder'])}"
+        )
     return lines
 
 

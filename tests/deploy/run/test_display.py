@@ -112,6 +112,7 @@ def test_a_run_ends_with_a_verdict_in_three_lines_and_one_for_each_thing_that_we
     _, answers, _, stopped, log = rows_of(ended(view, fallbacks=2, log_messages=lacks))
     assert answers.startswith("2 answers came late or not at all")
     assert "brakeline train --resume /very/long" in stopped and log == "messages in the log: 6; NOT in the log: 4"
+    assert rows_of(ended(view, folder="runs/my run"))[2].startswith("next: brakeline analyse 'runs/my run' --html")
     (only,) = rows_of(ended(view, steps=0, learners={}))
     assert only.startswith("ended before the first step") and "resume" not in only
 
