@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,8 @@ class CollectCommand:
         figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
         figures |= {"digest": data.digest(), "about": data.about}
         counts = f"{data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}"
-        print_result(self.json, figures, f"{path}: {counts}", f"next: brakeline certify {self.robot} --data {path}")
+        following = shlex.join(["brakeline", "certify", self.robot, "--data", str(path)])
+        print_result(self.json, figures, f"{path}: {counts}", f"next: {following}")
         return 0
 
     def _check(self) -> None:

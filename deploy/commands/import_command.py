@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -74,7 +75,7 @@ class ImportCommand:
         )
         counts = f"{imported.data.periods} periods in {imported.report.trajectories} trajectories"
         missing = [Text.from_markup(f"[yellow]missing:[/] {escape(text)}") for text in covered.missing]
-        next_command = f"brakeline certify {self.robot} --data {path} --use"
+        next_command = shlex.join(["brakeline", "certify", self.robot, "--data", str(path), "--use"])
         following = [] if covered.refused else [f"{path}: {counts}", f"next: {next_command}"]
         print_result(self.json, figures, *imported.report.notes, coverage_table(covered), lengths, *missing, *following)
         if covered.refused and not self.json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -70,7 +71,7 @@ class RobotCommand:
         path.write_text(text)
         following = f"{path}: fill it in, then `brakeline robot check {path}`"
         if words := options.words():
-            logs = " ".join(map(str, self.from_))
+            logs = shlex.join(map(str, self.from_))
             following += f" and `brakeline import {logs} --robot {path} {words}`"
         print_result(self.json, {"file": str(path), "notes": list(notes)}, *notes, following)
         return 0

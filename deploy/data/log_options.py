@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -58,14 +59,10 @@ class LogOptions:
         return [replace(t, rank=CHOSEN_RANK) if t.name in self.topics else t for t in tables]
 
     def words(self) -> str:
-        """Return the options as words of a command line."""
-        words = [f"--map {' '.join(_quoted(f'{k}={v}') for k, v in self.fields.items())}"] if self.fields else []
-        words += [f"--unit {' '.join(_quoted(f'{k}={v}') for k, v in self.units.items())}"] if self.units else []
-        return " ".join(words + ([f"--topics {' '.join(self.topics)}"] if self.topics else []))
-
-
-def _quoted(word: str) -> str:
-    return f'"{word}"' if " " in word else word
+        """Return the options as words of a command line, as a shell takes them."""
+        places, units = ([f"{name}={value}" for name, value in of.items()] for of in (self.fields, self.units))
+        given = {"--map": places, "--unit": units, "--topics": self.topics}
+        return " ".join(shlex.join([option, *words]) for option, words in given.items() if words)
 
 
 PLAIN = LogOptions()

@@ -3,6 +3,7 @@
 import io
 import math
 import re
+import shlex
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
@@ -336,7 +337,7 @@ def test_columns_are_chosen_on_robot_new_and_import(driven, tmp_path, capsys):
     assert robot.state == ("x [m]", "y [m]", "heading [rad]", "v [m/s]", "w [rad/s]")
     assert robot.action == ("v [m/s]", "w [rad/s]")
     said = " ".join(capsys.readouterr().out.split())
-    assert "brakeline import" in said and '--map x=q0 y=q1 heading=q2 v=q3 w=q4 "command v=q5"' in said
+    assert "brakeline import" in said and "--map x=q0 y=q1 heading=q2 v=q3 w=q4 'command v=q5'" in said
     out = tmp_path / "a.safetensors"
     toml = str(tmp_path / "my.toml")
     assert main(["import", str(path), "--robot", toml, "--map", *places, "--out", str(out)]) == 0
@@ -344,6 +345,18 @@ def test_columns_are_chosen_on_robot_new_and_import(driven, tmp_path, capsys):
     narrow = write_csv(tmp_path / "narrow.csv", time, some, (*COLUMNS, *names[-20:]))
     robot, text = described(narrow, name="narrow")
     assert len(robot.state) == 5 and "left out, as the motion shows no role of them: sensor_180" in text
+
+
+def test_a_command_that_is_printed_can_be_given_to_a_shell(driven, tmp_path, capsys):
+    """Names with parentheses, and a path with spaces."""
+    path, robot = tmp_path / "my drive.csv", tmp_path / "my.toml"
+    write_csv(path, *driven, [{"x": "x(m)(raw)", "speed": "command speed"}.get(name, name) for name in COLUMNS])
+    places = ["x=x(m)(raw)", *(f"{name}={name}" for name in ("y", "heading", "v", "w")), "command speed=command speed"]
+    assert main(["robot", "new", str(robot), "--from", str(path), "--map", *places]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    words = shlex.split(re.search(r"`brakeline (import [^`]*)`", said)[1])
+    assert main([*words, "--out", str(tmp_path / "a.safetensors")]) in (0, 1)
+    assert words[1] == str(path) and words[words.index("--map") + 1 :] == places
 
 
 def test_several_logs_describe_one_robot(tmp_path, capsys):
