@@ -350,7 +350,8 @@ def test_columns_are_chosen_on_robot_new_and_import(driven, tmp_path, capsys):
 def test_a_command_that_is_printed_can_be_given_to_a_shell(driven, tmp_path, capsys):
     """Names with parentheses, and a path with spaces."""
     path, robot = tmp_path / "my drive.csv", tmp_path / "my.toml"
-    write_csv(path, *driven, [{"x": "x(m)(raw)", "speed": "command speed"}.get(name, name) for name in COLUMNS])
+    time, values = driven
+    write_csv(path, time, values, [{"x": "x(m)(raw)", "speed": "command speed"}.get(name, name) for name in COLUMNS])
     places = ["x=x(m)(raw)", *(f"{name}={name}" for name in ("y", "heading", "v", "w")), "command speed=command speed"]
     assert main(["robot", "new", str(robot), "--from", str(path), "--map", *places]) == 0
     said = " ".join(capsys.readouterr().out.split())
