@@ -106,8 +106,11 @@ def test_a_pilot_keeps_the_vehicle_also_if_the_actor_is_replaced(flown: tuple[st
         autopilot.flight.mode = Mode.HOLD
         time.sleep(2.0)
         with actor(url) as next_vehicle:
-            period = next_vehicle.wait(next_vehicle.current_period.number + 10)
-            assert period.number > number and "HOLD" in period.lost and autopilot.flight.mode is Mode.HOLD
+            next_vehicle.wait(next_vehicle.current_period.number + 5)
+            periods = [next_vehicle.wait(next_vehicle.current_period.number + 1) for _ in range(10)]
+            assert periods[0].number > number and autopilot.flight.mode is Mode.HOLD
+            # On a machine that stalls, a period may also lack telemetry, and says that instead.
+            assert all(period.lost for period in periods) and any("HOLD" in period.lost for period in periods)
             autopilot.flight.mode = Mode.OFFBOARD  # the pilot gives it back
             until(lambda: not next_vehicle.current_period.lost, "the next actor flies on", 10.0)
 

@@ -64,7 +64,7 @@ def test_each_window_counts_in_its_kinds_beside_what_is_stated(stats):
     assert kinds["slow"]["excess"] == 2.5 and kinds["jumping inputs"]["excess"] == math.inf
     assert {kind for kind, row in kinds.items() if row["bound"] is not None} == {"standing"}
     assert kinds["standing"]["bound"] == 0.01
-    columns = [list(column.cells) for column in _driving("ground", kinds).columns]
+    columns = [list(map(str, column.cells)) for column in _driving("ground", kinds).columns]
     assert [cells[columns[0].index("standing")] for cells in columns] == ["standing", "7", "2 (28.57%)", "≤ 1 %"]
     assert [cells[columns[0].index("fast")] for cells in columns] == ["fast", "5", "1 (20.00%)", "–"]
 
