@@ -50,7 +50,7 @@ class CampaignCommand:
     accept_bound: options.AcceptBound = None
     engine: options.Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     again: bool = False
-    """Drive again what has results already."""
+    """Delete the results of these parts first, and drive them again."""
     results: Path = Path("results/campaign")
     """Store the tables in this folder. A table keeps the cells of earlier campaigns."""
     runs: Path = Path("runs/campaign")

@@ -79,7 +79,7 @@ class CompareCommand:
     table: bool = False
     """Run nothing: write tables, figures and the results page (README.md) from the stored results."""
     again: bool = False
-    """Run again what has results already."""
+    """Delete the results of these parts first, and run them again."""
     conservatism: bool = True
     """Also make the table of error bounds and modes, if a policy of the robot is stored."""
     penalty: float | None = None
