@@ -60,6 +60,7 @@ class DrivingStats:
                     "bound": self._bound(name, kind, counts.models),
                 }
                 for kind, counts in kinds.items()
+                if counts.windows
             }
             for name, kinds in self._kinds.items()
         }
@@ -73,10 +74,11 @@ class DrivingStats:
         start = [0 if e.request.past_from_start else robot.horizon for e in exchanges]
         scores = np.array([e.reply.decision.score for e in exchanges])
         places = np.column_stack([np.zeros(len(start), dtype=np.int64), start])
-        for kind, members in driving_kinds(robot, z, places).items():
-            if members.any():
-                versions = Counter(exchanges[row].reply.decision.model for row in np.flatnonzero(members))
-                self._kinds[robot.name][kind].add(scores[members], versions)
+        for kind, members in driving_kinds(
+            robot, z, places
+        ).items():  # all kinds, so that their order is always the same
+            versions = Counter(exchanges[row].reply.decision.model for row in np.flatnonzero(members))
+            self._kinds[robot.name][kind].add(scores[members], versions)
 
     def _bound(self, robot: str, kind: str, models: Counter[str]) -> float | None:
         about = self._metadata.get(f"model {robot}", {})
@@ -99,7 +101,7 @@ class _Kind:
     def add(self, scores: Array, models: Counter[str]) -> None:
         self.windows += len(scores)
         self.outside += int((~(scores <= 1.0)).sum())
-        self.excess = max(self.excess, float(np.nan_to_num(scores, nan=math.inf).max()))
+        self.excess = max(self.excess, float(np.nan_to_num(scores, nan=math.inf).max(initial=0.0)))
         self.models.update(models)
 
 

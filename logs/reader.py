@@ -238,7 +238,7 @@ def find(paths: Paths) -> tuple[Path, ...]:
     return tuple(path for segments in runs.values() for path in sorted(segments, key=number_of))
 
 
-def keep_log(path: Path) -> None:
+def refuse_to_overwrite_log(path: Path) -> None:
     """Check that a file that you will write is not a log, which would be lost. Raises LogError."""
     if not path.is_file():
         return

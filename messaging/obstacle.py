@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brakeline.errors import BadShape
-from brakeline.messaging.obstacle_motion import Motion, keep_vectors
+from brakeline.messaging.obstacle_motion import Motion, freeze_vectors
 from brakeline.messaging.value_equality import ComparedByValue
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         try:
-            keep_vectors(self, "position", "size")
+            freeze_vectors(self, "position", "size")
             self._check()
         except BadShape:
             raise

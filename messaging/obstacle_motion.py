@@ -15,7 +15,7 @@ from typing import Any
 ROUNDING = 1e-9  # when two measurements are compared [m, m/s]
 
 
-def keep_vectors(owner: Any, *names: str) -> None:
+def freeze_vectors(owner: Any, *names: str) -> None:
     """Make tuples of a frozen dataclass's arrays and lists: a tracker overwrites its arrays."""
     for name in names:
         if not isinstance(value := getattr(owner, name), tuple) and hasattr(value, "__len__"):
@@ -31,7 +31,7 @@ class Sighting:
     since: float  # time between the previous measurement and this one [s]
 
     def __post_init__(self) -> None:
-        keep_vectors(self, "position", "velocity")
+        freeze_vectors(self, "position", "velocity")
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Motion:
     before: Sighting | None = None
 
     def __post_init__(self) -> None:
-        keep_vectors(self, "velocity")
+        freeze_vectors(self, "velocity")
 
     def problem(self, dim: int) -> str:
         """Return the reason why this is no valid motion of an obstacle with `dim` coordinates; empty if it is valid."""

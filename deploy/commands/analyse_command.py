@@ -26,7 +26,8 @@ class AnalyseCommand:
     episode: int | None = None
     """Show each step of the episode with this number, of each actor."""
     actor: str | None = None
-    """With --episode, show the episode of this actor only: of several runs, of actor-0 of each, or of RUN/actor-0."""
+    """With --episode, show the episode of this actor only. With several runs, actor-0 means that of each run, and
+    RUN/actor-0 that of one."""
     verbose: Verbose = False
     quiet: Quiet = False
     json: Json = False
@@ -36,14 +37,14 @@ class AnalyseCommand:
     def run(self) -> int:
         """Print the figures. Returns the exit status."""
         from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
-        from brakeline.logs.reader import keep_log
+        from brakeline.logs.reader import refuse_to_overwrite_log
 
         if self.json and self.csv:
             raise ValueError("--json and --csv exclude each other: give one of them")
         if self.actor is not None and self.episode is None:
             raise ValueError("--actor selects an episode's actor: give --episode too")
         if self.html is not None:
-            keep_log(self.html)
+            refuse_to_overwrite_log(self.html)
         with under_way("reading " + ", ".join(map(str, self.logs))):
             analysis = analyse_runs(list(self.logs), AnalysisOptions(self.html is not None, self.episode, self.actor))
         figures = analysis.figures()

@@ -37,10 +37,10 @@ class ExportCommand:
 
     def run(self) -> int:
         """Write the files. Returns the exit status."""
-        from brakeline.logs.reader import Damage, keep_log, open_log
+        from brakeline.logs.reader import Damage, open_log, refuse_to_overwrite_log
 
         for path in filter(None, (self.csv, self.tlog)):
-            keep_log(path)
+            refuse_to_overwrite_log(path)
         figures, damage = dict[str, Any](), Damage()
         writers: dict[str, Callable[[Log, Any], dict[str, Any]]] = {
             **{"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove, "tlog": self._tlog}

@@ -38,9 +38,10 @@ class BusSettings:
         connect: endpoints of routers. A client uses the first one that answers, and reconnects by itself later.
         listen: endpoints at which the process is a router.
         patience: time to wait for a router at the start [s].
-        lease: time after which a peer that says nothing counts as gone [s]. On a busy machine a process may get no
-            processor time for seconds, and a recorder must not lose what was published meanwhile.
-        query_lease: the same for a client that asks or answers queries [s]: another service answers in its place.
+        lease: time after which a peer that sends nothing counts as gone [s]. On a busy machine, a process may get no
+            processor time for seconds, and a recorder must not lose what others publish meanwhile.
+        query_lease: the same time for a client that asks or answers queries [s]. It is short, so that another service
+            soon answers in place of one that hangs.
         stall: time for which a publisher waits for a receiver that reads nothing, before it closes the link [s].
         keys: folder with the keys (messaging/bus/certificate_authority.py).
         metrics: PORT or HOST:PORT at which the process serves its metrics; empty: it serves none.

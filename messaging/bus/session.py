@@ -65,7 +65,7 @@ class Bus:
         # A router is one session; the two links of each client end in it separately.
         self._queries = self._telemetry if settings.listen else open_session(settings, source, settings.query_lease)
         self._query_client = QueryClient(self._queries)
-        # Of the session with the short lease: a process that hangs soon counts as gone.
+        # The session with the short lease has the token, so that a process that hangs counts as gone within seconds.
         self._token = self._queries.liveliness().declare_token(self._full(ALIVE.format(source=source)))
 
     def __enter__(self) -> Self:

@@ -100,8 +100,8 @@ class VisibilityMemory(ABC, Generic[S]):
         self._begun = True
         if scan is None:
             if self._last is None:
-                return _apart(self.nothing)
-            return _apart(replace(self._last, age=min(self._last.age + self._since_last, VERY_OLD)))
+                return _with_own_ranges(self.nothing)
+            return _with_own_ranges(replace(self._last, age=min(self._last.age + self._since_last, VERY_OLD)))
         scan, self._used = self._copied(scan), True
         if self._first is None:
             self._first = scan
@@ -115,7 +115,7 @@ class VisibilityMemory(ABC, Generic[S]):
             filled = replace(scan, ranges=ranges)
         self._store(scan)
         self._last, self._since_last = filled, 0.0
-        return _apart(filled)
+        return _with_own_ranges(filled)
 
     @abstractmethod
     def _copied(self, scan: S) -> S:
@@ -141,7 +141,7 @@ class VisibilityMemory(ABC, Generic[S]):
         return np.asarray(np.linalg.norm(points - _position(self._first), axis=-1) <= self._start_radius - drift)
 
 
-def _apart(scan: S) -> S:
+def _with_own_ranges(scan: S) -> S:
     """Return a scan with ranges of its own, which the caller may overwrite; their values need no second check."""
     other = copy.copy(scan)
     object.__setattr__(other, "ranges", scan.ranges.copy())

@@ -153,7 +153,7 @@ def _text(path: Path) -> tuple[str, bool]:
     data = path.read_bytes()
     encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     text = data.decode(encoding, errors="replace")
-    if "\ufffd" in text and text.replace("\ufffd", "").isascii():  # not one letter is UTF-8: it is of a Windows program
+    if "\ufffd" in text and text.replace("\ufffd", "").isascii():  # no letter is UTF-8: a Windows program wrote it
         text = data.decode("cp1252", errors="replace")
     return text.replace("\0", ""), text.endswith(("\n", "\r"))
 

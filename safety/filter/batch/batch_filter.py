@@ -43,7 +43,7 @@ class BatchFilter:
         self._prepared: dict[tuple[str, str], LaneDecisions] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy gets. It prepares its own arrays: these hold their namespace, a module."""
+        """Return the state for a copy, without prepared arrays: they refer to a module, which nobody can copy."""
         return vars(self) | {"_prepared": {}}
 
     def decide(self, requests: RequestArrays) -> DecisionArrays:
