@@ -74,9 +74,8 @@ class DrivingStats:
         start = [0 if e.request.past_from_start else robot.horizon for e in exchanges]
         scores = np.array([e.reply.decision.score for e in exchanges])
         places = np.column_stack([np.zeros(len(start), dtype=np.int64), start])
-        for kind, members in driving_kinds(
-            robot, z, places
-        ).items():  # all kinds, so that their order is always the same
+        kinds = driving_kinds(robot, z, places)
+        for kind, members in kinds.items():  # also kinds without a window, so that the order is always the same
             versions = Counter(exchanges[row].reply.decision.model for row in np.flatnonzero(members))
             self._kinds[robot.name][kind].add(scores[members], versions)
 
