@@ -25,7 +25,7 @@ from brakeline.messaging.stated_share import percent
 from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import correction_penalty
-from brakeline.safety.gym_checks import check_robot
+from brakeline.safety.gym_checks import age_of_acceleration, check_robot
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.in_process import InProcess, request_observation
@@ -71,6 +71,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         actions: ActionMapping | None = None,
         accept_bound: float | None = None,
         turn_aside: bool = False,
+        acceleration_age: float | None = None,
     ) -> None:
         """Wrap an environment.
 
@@ -88,6 +89,9 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 limit of the client or of its service.
             turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on. A client
                 whose backup plan asks for it does so anyway.
+            acceleration_age: the states hold the horizontal acceleration of this long ago [s]. Defaults to
+                `info["acceleration_age"]` of `reset`, or to that of the client, or to 0. If the data of the model set
+                have another age, `reset` raises `Mismatch`.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given. Or the environment
@@ -97,7 +101,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             ValueError: `accept_bound` is not above 0 and at most 1, or the penalty is negative or not finite.
         """
         kept = {"penalty": penalty, "state": state, "obstacles": obstacles, "actions": actions}
-        kept |= {"accept_bound": accept_bound, "turn_aside": turn_aside}
+        kept |= {"accept_bound": accept_bound, "turn_aside": turn_aside, "acceleration_age": acceleration_age}
         if not isinstance(filter, FilterClient):  # a client has the backup plan of one robot: no second one may use it
             kept["filter"] = filter
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
@@ -108,7 +112,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
         check_numbers(self, "penalty", least=0.0)
         self.backup_plan.turn_aside |= turn_aside
-        self._state, self._obstacles = state, obstacles
+        self._state, self._obstacles, self._acceleration_age = state, obstacles, acceleration_age
         self._actions = mapping_for_space(env.action_space, self.client.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
         self._memory = memory_of(self.client.robot)
@@ -134,6 +138,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
+        age, method = self.backup_plan.acceleration_age, getattr(self.client, "method", None)
+        self.backup_plan.acceleration_age = age_of_acceleration(info, self._acceleration_age, age, method)
         self._now = copied((observation, info))
         self.client.reset()
         self._plan = self.backup_plan.plan
@@ -185,6 +191,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 raise
             reason = str(error)
         except BusError as error:
+            if getattr(error, "field", "") == "acceleration_age":  # the service would refuse every step
+                raise
             reason = str(error)
         self.client.fallback()
         return None, reason

@@ -13,7 +13,7 @@ from brakeline.errors import Mismatch
 from brakeline.messaging.number_checks import check_numbers
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
-from brakeline.safety.gym_checks import check_filter, check_robot, check_rows
+from brakeline.safety.gym_checks import age_of_acceleration, check_filter, check_robot, check_rows
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -40,6 +40,7 @@ class BatchSafetyWrapper(VectorWrapper):
         penalty: float = 0.0,
         accept_bound: float | None = None,
         turn_aside: bool = False,
+        acceleration_age: float | None = None,
     ) -> None:
         """Wrap an environment; see `SafetyWrapper` for the arguments. `RowByRow` makes a filter of a rival.
 
@@ -67,6 +68,7 @@ class BatchSafetyWrapper(VectorWrapper):
         self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs, turn_aside), penalty
         check_numbers(self, "penalty", least=0.0)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self._acceleration_age = acceleration_age
         self._infos: dict[str, Any] | None = None
         self._observations: Any = None
         self._ended = np.zeros(env.num_envs, dtype=bool)
@@ -77,6 +79,7 @@ class BatchSafetyWrapper(VectorWrapper):
         # Some environments take the mask out of the options that they get.
         options = None if options is None else dict(options)
         observations, infos = self.env.reset(seed=seed, options=options)
+        self.plans.acceleration_age = age_of_acceleration(infos, self._acceleration_age, 0.0, self.plans.safety)
         self._keep(observations, infos)
         self.plans.reset(which)
         self._ended = self._ended & ~which

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,34 @@ def check_filter(filter: Any) -> None:
     """Check what decides for many robots. Raises TypeError: it is no filter, or a client, which serves one robot."""
     if isinstance(filter, FilterClient) or not hasattr(filter, "robot"):
         raise TypeError(f"a filter is needed here, not a {type(filter).__name__}: give Filter.load(NAME_OR_PATH)")
+
+
+def age_of_acceleration(infos: Mapping[str, Any], given: float | None, otherwise: float, method: Any) -> float:
+    """Return the age of the horizontal acceleration in the states of one environment or of many [s].
+
+    Args:
+        infos: their infos, which may state it as `acceleration_age`.
+        given: what the user states instead.
+        otherwise: the age if nothing states one.
+        method: the filter. A client or a rival states no age here.
+
+    Raises:
+        Mismatch: the environments have different ages, or another one than the filter's data.
+    """
+    rows = np.asarray(infos.get("_acceleration_age", True))  # of a masked reset: the other rows hold zeros
+    stated, rows = np.broadcast_arrays(infos.get("acceleration_age", otherwise) if given is None else given, rows)
+    ages = sorted(set(stated[rows].tolist()))
+    if len(ages) > 1:
+        listed = ", ".join(f"{age:g} s" for age in ages)
+        raise Mismatch(f"the environments' states hold horizontal accelerations of different ages ({listed})")
+    age = float(ages[0]) if ages else otherwise
+    if (recorded := getattr(method, "acceleration_age", None)) not in (None, age):
+        raise Mismatch(
+            f"the model set was recorded with the horizontal acceleration of {recorded:g} s ago, the environment's "
+            f"states have that of {age:g} s ago. If they have the same one, give acceleration_age={recorded:g}; "
+            "otherwise, report the same one, or use a model set of data with yours"
+        )
+    return age
 
 
 def check_rows(inputs: Array, count: int, robot: Robot) -> None:

@@ -19,7 +19,7 @@ from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import diagnostics, is_measurement_fault
-from brakeline.safety.gym_checks import check_filter, check_robot, check_rows
+from brakeline.safety.gym_checks import age_of_acceleration, check_filter, check_robot, check_rows
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.filter_client import Answer
 from brakeline.safety.service.in_process import InProcess, request_observation
@@ -48,6 +48,7 @@ class VectorSafetyWrapper(VectorWrapper):
         actions: ActionMapping | None = None,
         accept_bound: float | None = None,
         turn_aside: bool = False,
+        acceleration_age: float | None = None,
     ) -> None:
         """Wrap a vector environment; see `SafetyWrapper` for the arguments.
 
@@ -61,7 +62,7 @@ class VectorSafetyWrapper(VectorWrapper):
         check_robot(env.unwrapped.envs[0] if isinstance(env.unwrapped, SyncVectorEnv) else env, filter.robot)
         check_numbers(self, "penalty", least=0.0)
         self.backup_plans = [BackupPlan(filter.robot, turn_aside) for _ in range(env.num_envs)]
-        self._state, self._obstacles = state, obstacles
+        self._state, self._obstacles, self._acceleration_age = state, obstacles, acceleration_age
         self._actions = mapping_for_space(env.single_action_space, filter.robot, actions)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._ended = np.zeros(env.num_envs, dtype=bool)
@@ -73,6 +74,9 @@ class VectorSafetyWrapper(VectorWrapper):
         which = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
         # Gymnasium takes the mask out of the options that it gets.
         observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
+        age = age_of_acceleration(infos, self._acceleration_age, 0.0, self.client.method)
+        for backup_plan in self.backup_plans:
+            backup_plan.acceleration_age = age
         if self._now is not None:
             infos = with_earlier_rows(infos, self._now[1], ~which)
         self._now = copied((observations, infos))

@@ -243,7 +243,7 @@ class Filter:
         Raises:
             BadRequest: an array has the wrong shape, or a row is not valid; the error names the field and the row.
         """
-        self._check_age(0.0)
+        self._check_age(requests.acceleration_age)
         return self._batch.decide(requests)
 
     def decide_all(self, requests: Sequence[Request]) -> list[Decision]:
@@ -270,7 +270,7 @@ class Filter:
             raise BadRequest(
                 "acceleration_age",
                 f"the model set was recorded with the horizontal acceleration of {self.acceleration_age:g} s ago; this "
-                f"state has that of {age:g} s ago: report the same one",
+                f"state has that of {age:g} s ago: report the same `acceleration_age`",
             )
 
     def _note_unrecorded(self, wanted: Array, search: PlanSearch, candidate: PlanCandidate | None) -> None:

@@ -307,6 +307,7 @@ class SafetyClient(BusClient):
         deadline: float = DEADLINE,
         keys: Path | str | None = None,
         name: str = "client",
+        acceleration_age: float = 0.0,
     ) -> Self:
         """Return a client with a bus of its own.
 
@@ -316,13 +317,14 @@ class SafetyClient(BusClient):
             deadline: longest wait for a decision [s].
             keys: the folder with the keys of `name`, on a bus with keys.
             name: of this client on the bus.
+            acceleration_age: your states hold the horizontal acceleration of this long ago [s].
 
         Raises:
             Unreachable: there is no router at the endpoints.
             BadKeys: the folder has no keys of that name.
             ValueError: the deadline is not above 0 and at most a day.
         """
-        return cls._opened(connect, keys, name, robot, deadline)
+        return cls._opened(connect, keys, name, robot, deadline, acceleration_age)
 
     def decide(
         self,

@@ -40,8 +40,15 @@ class FleetClient(BusClient):
     ['allowed', 'allowed']
     """
 
-    def __init__(self, bus: Bus, robot: Robot | Path | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
-        """Make a client for robots of one kind; names: of the robots.
+    def __init__(
+        self,
+        bus: Bus,
+        robot: Robot | Path | str,
+        names: Sequence[str],
+        deadline: float = DEADLINE,
+        acceleration_age: float = 0.0,
+    ) -> None:
+        """Make a client for robots of one kind; names: of the robots. acceleration_age: see `SafetyClient`.
 
         Raises:
             ValueError: there are fewer than two names, or two are equal, or the robot has no position; or the deadline
@@ -53,7 +60,7 @@ class FleetClient(BusClient):
         if not self.robot.position_dim:
             raise ValueError(f"{self.robot.name} has no position, so it reserves no space: use a SafetyClient for each")
         self.names = tuple(names)
-        self.backup_plans = [BackupPlan(self.robot) for _ in self.names]
+        self.backup_plans = [BackupPlan(self.robot, acceleration_age=acceleration_age) for _ in self.names]
         self._episode = self._step = 0
 
     @classmethod
@@ -65,9 +72,10 @@ class FleetClient(BusClient):
         deadline: float = DEADLINE,
         keys: Path | str | None = None,
         name: str = "client",
+        acceleration_age: float = 0.0,
     ) -> Self:
         """Return a client with a bus of its own. For the other arguments and errors, see `SafetyClient.open`."""
-        return cls._opened(connect, keys, name, robot, names, deadline)
+        return cls._opened(connect, keys, name, robot, names, deadline, acceleration_age)
 
     def decide(
         self,

@@ -26,7 +26,7 @@ def on_host(array: Array) -> NDArray[Any]:
 
 
 def mapped(whole: T, change: Callable[[Array], Array]) -> T:
-    """Return a nested value with every array changed. Flags, texts, plain tuples and None stay as they are."""
+    """Return a nested value with every array changed. Flags, numbers, texts, plain tuples and None stay as they are."""
     part: Any = whole
     if isinstance(part, list):
         part = [mapped(one, change) for one in part]
@@ -34,7 +34,7 @@ def mapped(whole: T, change: Callable[[Array], Array]) -> T:
         part = type(part)(*(mapped(one, change) for one in part))
     elif hasattr(part, "__dataclass_fields__"):
         part = type(part)(*(mapped(getattr(part, field.name), change) for field in fields(part)))
-    elif not (part is None or isinstance(part, bool | str | tuple)):
+    elif not (part is None or isinstance(part, int | float | str | tuple)):
         part = change(part)
     return part  # type: ignore[no-any-return]
 

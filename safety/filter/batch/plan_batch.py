@@ -51,6 +51,9 @@ class BackupPlanBatch:
 
     It is for robots in lockstep, without feedback and without reservations, in a batch with one filter. A row
     without a valid decision follows its committed plan. If the filter raises an error, all rows do.
+
+    Attributes:
+        acceleration_age: age of the horizontal acceleration in the measured states [s] (`RequestArrays`).
     """
 
     def __init__(self, safety: BatchMethod, size: int, turn_aside: bool = False) -> None:
@@ -65,6 +68,7 @@ class BackupPlanBatch:
         N, n, m = robot.horizon, robot.state_dim, robot.action_dim
         self.independent = False  # a robot forgets its scores when an episode begins, so no episode depends on another
         self.safety, self.robot, self._size, self._turn_aside = safety, robot, size, turn_aside
+        self.acceleration_age = 0.0
         # plan (B, N, m), input_in_force (B, m): see `BackupPlan`
         self.plan, self.input_in_force = np.zeros((size, N, m)), np.zeros((size, m))
         # the sets of the next measured states
@@ -120,6 +124,7 @@ class BackupPlanBatch:
             predicted=self.predicted if self.predicted.given.any() else None,
             past=past if self._judged and past.given.any() else None,
             observation=observations,
+            acceleration_age=self.acceleration_age,
         )
 
     def decide(

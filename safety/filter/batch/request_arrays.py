@@ -97,6 +97,7 @@ class RequestArrays:
         predicted: None if no robot has one.
         past: None if no robot has one.
         observation (B, o): input of a rival's networks, float32; the filter does not need it.
+        acceleration_age: see `Request`; the same for all robots.
     """
 
     state: Array
@@ -112,6 +113,7 @@ class RequestArrays:
     predicted: PredictionArrays | None = None
     past: PastArrays | None = None
     observation: Array | None = None
+    acceleration_age: float = 0.0
 
     def __len__(self) -> int:
         return int(self.state.shape[0])
@@ -191,6 +193,7 @@ class RequestArrays:
             state_widening=1.0 if self.state_widening is None else float(self.state_widening[index]),
             past=past,
             observation=np.zeros(0, np.float32) if self.observation is None else on_host(self.observation[index]),
+            acceleration_age=self.acceleration_age,
         )
 
 

@@ -33,7 +33,7 @@ class RowByRow:
 
     def __init__(self, method: Method) -> None:
         self._method, self.robot, self.version = method, method.robot, method.version
-        self.model = getattr(method, "model", None)
+        self.model, self.acceleration_age = getattr(method, "model", None), getattr(method, "acceleration_age", None)
 
     def decide_batch(self, requests: RequestArrays) -> DecisionArrays:
         """Decide on NumPy arrays. Raises BadRequest: a value is missing, not finite, or has the wrong size."""
