@@ -13,6 +13,7 @@ from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import Disc
+from brakeline.messaging.scan import Scan
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.batch import lane_decisions, qp_batch, search_batch
@@ -24,6 +25,7 @@ from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
+from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.filter.widening import PastWindow
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
@@ -388,6 +390,24 @@ def test_decide_all_keeps_the_order_and_decides_singly_what_does_not_fit():
     assert len(ready.decide_all(requests[:3])) == 3
     with pytest.raises(BadRequest, match="obstacles"):
         ready.decide_all([*requests, replace(requests[0], obstacles=Shapes.of([], 2), known_free=False)])
+
+
+def test_what_has_no_place_in_a_batch_is_not_left_out_in_silence():
+    mover = Obstacle("cylinder", (0.3, 0.0), (0.1,), motion=Motion(velocity=(0.0, 0.1), position_error=0.01, speed=0.2))
+    one = replace(scenes(ground(), 1)[0], known_free=True)
+    reserved = ground().standing_reservation(one.state)
+    for wrong, what in (
+        ({"movers": split_moving([mover], 2)[1]}, "moving obstacles"),
+        ({"scan": Scan(np.ones(4), np.arange(4.0), (0.0, 0.0, 0.0))}, "a scan"),
+        ({"reservation": reserved, "other_reservations": OtherReservations.to([reserved])}, "a reservation, reserv"),
+    ):
+        with pytest.raises(BadRequest, match=f"row 1: a batch has no place for {what}.*decide_all"):
+            RequestArrays.of([one, replace(one, **wrong)])
+    with pytest.raises(BadRequest, match=r"one age, not \[0.0, 0.2\]"):
+        RequestArrays.of([one, replace(one, acceleration_age=0.2)])
+    assert RequestArrays.of([replace(one, acceleration_age=0.2)]).acceleration_age == 0.2
+    with pytest.raises(ValueError, match="at least one request"):
+        RequestArrays.of([])
 
 
 def test_a_client_in_process_asks_for_many_at_once(monkeypatch):

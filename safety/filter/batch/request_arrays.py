@@ -121,16 +121,25 @@ class RequestArrays:
     @staticmethod
     def fits(request: Request, check: FastRequestCheck) -> bool:
         """Return whether a request has a place in a batch. `check`: the robot's own check of all numbers."""
-        others = request.movers, request.scan, request.reservation, request.other_reservations
-        return all(other is None for other in others) and not request.acceleration_age and check(request)
+        return not _without_place(request) and not request.acceleration_age and check(request)
 
     @staticmethod
     def of(requests: Sequence[Request]) -> RequestArrays:
-        """Pack requests that fit, of one kind of robot, as NumPy arrays.
+        """Pack requests about one kind of robot as NumPy arrays, without their observations.
 
         Raises:
-            BadRequest: an array has not the shape that the others have.
+            BadRequest: an array has not the shape that the others have. Or a request holds what has no place in a
+                batch, or the accelerations have different ages.
+            ValueError: there is no request.
         """
+        if not requests:
+            raise ValueError("a batch needs at least one request")
+        for row, request in enumerate(requests):
+            if lost := _without_place(request):
+                why = f"row {row}: a batch has no place for {', '.join(lost)}: give the requests to `Filter.decide_all`"
+                raise BadRequest(lost[0], why)
+        if len(ages := {request.acceleration_age for request in requests}) > 1:
+            raise BadRequest("acceleration_age", f"a batch has accelerations of one age, not {sorted(ages)}")
         given = np.array([request.predicted is not None for request in requests])
         center, half_width, heading = _packed(requests, "predicted", ("center", "half_width", "heading"))
         windows = np.array([request.past is not None for request in requests])
@@ -149,6 +158,7 @@ class RequestArrays:
             model=[request.model for request in requests],
             predicted=PredictionArrays(center, half_width, heading, given) if given.any() else None,
             past=PastArrays(states, inputs, from_start > 0.0, windows) if windows.any() else None,
+            acceleration_age=ages.pop(),
         )
 
     def mapped(self, change: Callable[[Array], Array]) -> RequestArrays:
@@ -197,7 +207,19 @@ class RequestArrays:
         )
 
 
+# The fields of a request that a batch has no place for, and how a program knows them
+_NO_PLACE = {
+    "movers": "moving obstacles",
+    "scan": "a scan",
+    "reservation": "a reservation",
+    "other_reservations": "reservations of other robots",
+}
 _ARRAYS = ("state", "action", "input_in_force", "plan")
+
+
+def _without_place(request: Request) -> list[str]:
+    """Return what a request holds that a batch has no place for."""
+    return [meaning for name, meaning in _NO_PLACE.items() if getattr(request, name) is not None]
 
 
 def _stacked(name: str, owners: Sequence[Any]) -> Array:
