@@ -316,8 +316,10 @@ def test_a_cut_episode_is_not_joined_with_the_next_one_whose_first_step_is_lost(
     curve = LearningCurve()
     for episode, numbers in ((0, range(5)), (1, range(1, 10))):
         for k in numbers:
-            curve.step(pb.Step(actor="a", episode=episode, step=k, reward=1.0, terminated=(episode, k) == (1, 9)))
-    assert curve.figures()["last"]["reward"] == 9.0
+            kind = pb.ALLOWED if episode else pb.ADJUSTED
+            curve.step(pb.Step(actor="a", episode=episode, step=k, decision=kind, terminated=(episode, k) == (1, 9)))
+    last = curve.figures()["last"]
+    assert (last["episodes"], last["interventions"], last["reward"]) == (1, 0.0, None)
 
 
 def test_a_change_shows_in_the_windows_the_widening_the_widths_and_the_model_sets() -> None:
