@@ -122,6 +122,12 @@ def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, PartState], dict
     return {name: _part(place, name, manifest["parts"].get(name)) for name in names}, manifest["about"]
 
 
+def about_latest(root: Path) -> dict[str, Any]:
+    """Return what `save` got as `about` of the latest checkpoint. Raises as `load`."""
+    about: dict[str, Any] = _manifest(latest(root))["about"]
+    return about
+
+
 def latest(root: Path) -> Path:
     """Return the folder of the latest checkpoint.
 

@@ -54,6 +54,26 @@ def closest_of(step: pb.Step) -> float:
     return step.closest if step.HasField("closest") else step.clearance
 
 
+@dataclass(slots=True)
+class StepSequence:
+    """Tells from the numbers of an actor's steps whether a log has all steps of an episode.
+
+    Attributes:
+        whole: all steps of the running episode came until now.
+    """
+
+    whole: bool = True
+    _index: int = 0
+    _step: int = -1
+
+    def add(self, step: pb.Step, begins: bool) -> None:
+        """Add the actor's next step; `begins`: it is the first one of an episode that is known."""
+        index, number = step.index, step.step  # in real time, a period without a step leaves out a number
+        follows = index == self._index + 1 if index else number == self._step + 1
+        self.whole = number == 0 or (follows and index > 0) if begins else self.whole and follows
+        self._index, self._step = index, number
+
+
 @dataclass
 class EpisodeStats:
     """Statistics of one actor's steps."""
@@ -82,10 +102,12 @@ class EpisodeStats:
     max_speed: float = 0.0  # m/s
     closest: float = math.inf  # m, least clearance within the periods
     clearance: QuantileSketch = field(default_factory=QuantileSketch)  # m, from the footprint to the nearest obstacle
-    returns: array[float] = field(default_factory=lambda: array("d"))  # per finished episode, without penalties
+    # Per finished episode, without penalties; NaN: a part of the episode is missing.
+    returns: array[float] = field(default_factory=lambda: array("d"))
     decision_ms: dict[int, QuantileSketch] = field(default_factory=lambda: {kind: QuantileSketch() for kind in KINDS})
     propose_ms: QuantileSketch = field(default_factory=QuantileSketch)
     intervention_rate: ClusteredProportion = field(default_factory=ClusteredProportion)  # by finished episode
+    _sequence: StepSequence = field(default_factory=StepSequence)
     _episode: int | None = None
     _return: float = 0.0
     _collided: bool = False
@@ -94,7 +116,9 @@ class EpisodeStats:
     def step(self, step: pb.Step) -> None:
         """Add the actor's next step. An unfinished episode counts only in the steps and the collisions."""
         episode = step.episode
-        if episode != self._episode or step.step == 0:
+        begins = episode != self._episode or step.step == 0
+        self._sequence.add(step, begins)
+        if begins:
             self._episode, self._return, self._collided = episode, 0.0, False
             self._begun_at = self.steps, self.interventions
             self.robot = self.robot or step.robot
@@ -148,7 +172,7 @@ class EpisodeStats:
         self.broken += step.broken
 
     def _end_episode(self, step: pb.Step) -> None:
-        self.returns.append(self._return)
+        self.returns.append(self._return if self._sequence.whole else math.nan)
         self.goals += step.goal
         self.timeouts += step.truncated and not step.terminated and not step.cut
         steps, interventions = self._begun_at
@@ -165,6 +189,7 @@ def closed_loop(parts: Iterable[EpisodeStats]) -> Figures:
 
     steps = total("steps")
     returns = np.concatenate([np.asarray(part.returns) for part in parts]) if parts else np.zeros(0)
+    whole = returns[np.isfinite(returns)]
     times = {name: [part.decision_ms[kind] for part in parts] for kind, name in KINDS.items()}
     total_ms = spread(*(part for parts in times.values() for part in parts))
     clearance = summary(*(part.clearance for part in parts))
@@ -173,7 +198,7 @@ def closed_loop(parts: Iterable[EpisodeStats]) -> Figures:
         **{name: total(name) for name in COUNTS},
         "mean_speed": math.fsum(part.speed for part in parts) / steps if steps else None,
         "max_speed": max(part.max_speed for part in parts) if steps else None,
-        "mean_reward": float(returns.mean()) if len(returns) else None,
+        "mean_reward": float(whole.mean()) if len(whole) else None,
         "decision_ms": total_ms and total_ms | {kind: spread(*parts) for kind, parts in times.items()},
         "propose_ms": spread(*(part.propose_ms for part in parts)),
         "containment": {"steps": total("compared"), "violations": total("violations")},

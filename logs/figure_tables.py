@@ -290,13 +290,12 @@ def _coarse(bins: list[Figures], most: int) -> list[Figures]:
     rows = []
     for start in range(0, len(bins), per):
         part = bins[start : start + per]
-        steps, episodes = sum(row["steps"] for row in part), sum(row["episodes"] for row in part)
-        interventions = sum(interventions_in(row) * row["steps"] for row in part) / steps
-        ended = [row for row in part if row["episodes"]]
-        means = {
-            name: sum(row[name] * row["episodes"] for row in ended) / episodes if episodes else None
-            for name in ("goals", "reward")
-        }
+        interventions = sum(interventions_in(row) * row["steps"] for row in part) / sum(row["steps"] for row in part)
+        means: Figures = {}
+        for name in ("goals", "reward"):
+            ended = [row for row in part if row[name] is not None]
+            episodes = sum(row["episodes"] for row in ended)
+            means[name] = sum(row[name] * row["episodes"] for row in ended) / episodes if ended else None
         sets = {name: max((row[name] for row in part if row[name] is not None), default=None) for name in SETS.values()}
         rows.append({"interventions": interventions, **means, **sets})
     return rows

@@ -7,11 +7,11 @@ which the steps of different actors arrive, so they are not part of `Metrics`.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
 
 from brakeline.logs.decision_explanation import plan_score
-from brakeline.logs.episode_stats import INTERVENTIONS, Figures, closest_of, kind_of
+from brakeline.logs.episode_stats import INTERVENTIONS, Figures, StepSequence, closest_of, kind_of
 from brakeline.logs.json_values import finite
 from brakeline.logs.quantiles import QuantileSketch, summary
 from brakeline.messaging import brakeline_pb2 as pb
@@ -34,7 +34,7 @@ def interventions_in(row: Figures) -> float:
 class Bin(Counter[str]):
     """Sums over consecutive steps and over the episodes that ended in them, by name."""
 
-    reward = 0.0  # of these episodes, without the intervention penalty
+    reward = 0.0  # of the `whole` ones of these episodes, without the intervention penalty
     closest = math.inf  # m
     widening = 1.0  # the largest of a request
     half_width = 0.0  # m, sum over the tubes of their largest half-width
@@ -70,6 +70,7 @@ class Episode:
     steps: int = 0
     interventions: int = 0
     reward: float = 0.0  # without the intervention penalty
+    whole: bool = True  # no part of the episode is missing
     goal: bool = False
     collision: bool = False
 
@@ -87,6 +88,7 @@ class LearningCurve:
         self.staleness = QuantileSketch()  # versions between a step's weights and the newest known weights
         self.last: deque[Episode] = deque(maxlen=LAST)
         self._running: dict[str, Episode] = {}
+        self._sequences: defaultdict[str, StepSequence] = defaultdict(StepSequence)  # by actor
         self._learned: list[tuple[float, ...]] = []  # points with the values of CURVES
         self._stride = 1  # learner messages per point
         self._messages = 0
@@ -109,8 +111,10 @@ class LearningCurve:
             self._newest = version
         self.staleness.add(self._newest - version)
         actor = step.actor
-        episode = self._running.get(actor)
-        if episode is None or step.step == 0 or step.episode != episode.number:
+        episode, sequence = self._running.get(actor), self._sequences[actor]
+        begins = episode is None or step.step == 0 or step.episode != episode.number
+        sequence.add(step, begins)
+        if episode is None or begins:
             episode = self._running[actor] = Episode(step.episode)
         episode.reward += step.reward
         episode.steps += 1
@@ -119,10 +123,12 @@ class LearningCurve:
             episode.collision = True
             now["collisions"] += 1
         if step.terminated or step.truncated:
-            episode.goal = step.goal
+            episode.goal, episode.whole = step.goal, sequence.whole
             now["episodes"] += 1
             now["goals"] += step.goal
-            now.reward += episode.reward
+            if sequence.whole:
+                now["whole"] += 1
+                now.reward += episode.reward
             self.last.append(self._running.pop(actor))
 
     def exchange(self, exchange: pb.Exchange) -> None:
@@ -151,7 +157,7 @@ class LearningCurve:
         self._messages += 1
 
     def figures(self) -> Figures:
-        """Return the curves. Each row of `bins` ends at the step `until`; None: no episode ended in the bin."""
+        """Return the curves. Each row of `bins` ends at the step `until`; None: no (whole) episode ended in the bin."""
         rows, until = [], 0
         for row in self.bins:
             until, steps, episodes = until + row["steps"], row["steps"], row["episodes"]
@@ -160,7 +166,7 @@ class LearningCurve:
                 ends = {
                     "goals": row["goals"] / episodes if episodes else None,
                     "collisions": row["collisions"],
-                    "reward": row.reward / episodes if episodes else None,
+                    "reward": row.reward / row["whole"] if row["whole"] else None,
                 }
                 closest = finite(row.closest)
                 row_steps = {"until": until, "steps": steps, **rates, "episodes": episodes, **ends, "closest": closest}
@@ -177,11 +183,12 @@ class LearningCurve:
     def _last(self) -> Figures:
         """Return the figures of the last episodes; None without an episode."""
         last, steps = list(self.last), sum(episode.steps for episode in self.last)
+        rewards = [episode.reward for episode in last if episode.whole]
         return {
             "episodes": len(last),
             "goals": sum(episode.goal for episode in last) / len(last) if last else None,
             "collisions": sum(episode.collision for episode in last),
-            "reward": math.fsum(episode.reward for episode in last) / len(last) if last else None,
+            "reward": math.fsum(rewards) / len(rewards) if rewards else None,
             "interventions": sum(episode.interventions for episode in last) / steps if steps else None,
         }
 

@@ -16,7 +16,7 @@ from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.mcap_container import LogChannel
 from brakeline.logs.metrics import Metrics, merge_runs
 from brakeline.logs.process_timeline import ProcessTimeline
-from brakeline.logs.reader import Log, Paths, by_run, find
+from brakeline.logs.reader import Log, Paths, by_run, find, without_copies
 from brakeline.logs.run_groups import GroupedRun, compare_groups, differences
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.structured_text import parse_json
@@ -265,7 +265,7 @@ def analyse_runs(paths: Paths, options: AnalysisOptions | None = None) -> LogAna
     Raises:
         LogError: a path has no log, or a file is not an MCAP file.
     """
-    runs, options = by_run(find(paths)), options or AnalysisOptions()
+    runs, options = by_run(without_copies(find(paths))), options or AnalysisOptions()
     several = len(runs) > 1
     options = replace(options, sketches=options.sketches // max(1, len(runs)))
     return LogAnalysis(

@@ -6,12 +6,13 @@ for record in read("runs/demo"):
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby, pairwise
+from itertools import combinations, groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +38,8 @@ from brakeline.messaging.bus.stated_names import check_names
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.message_checks import check
 from brakeline.messaging.topics import TOPICS, topic_of
+
+log = logging.getLogger("brakeline.logs")
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -293,18 +296,54 @@ def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:
                 yield MissingSegment(first, last, count)
 
 
+def without_copies(paths: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the files without runs that are copies of another run in their folder, such as a backup of its file.
+
+    A copy begins with the same message. Of a run and its copy, the one with more messages stays, or the older one.
+    """
+    runs = {run: tuple(files) for run, files in groupby(paths, key=_run_of)}
+    folders = Counter(folder for folder, _ in runs)
+    several = {run: files for run, files in runs.items() if folders[run[0]] > 1}
+    firsts = {run: {first_message(path) for path in files} for run, files in several.items()}
+    copies: set[Path] = set()
+    for one, other in combinations(several, 2):
+        same = one[0] == other[0] and None not in firsts[one] | firsts[other]
+        if same and (firsts[one] <= firsts[other] or firsts[other] <= firsts[one]):
+            kept, left_out = sorted((several[one], several[other]), key=_most_and_oldest)
+            if copies.isdisjoint((*kept, *left_out)):
+                copies.update(left_out)
+                log.warning("%s is a copy of %s, and is left out", left_out[0], kept[0])
+    return tuple(path for path in paths if path not in copies)
+
+
+def first_message(path: Path) -> tuple[str, int, int, bytes] | None:
+    """Return the first message of a known type in a file, with its key and times; None if there is none."""
+    with suppress(LogError, OSError):
+        for channel, log_time, publish_time, payload in Log((path,)).rows():
+            return channel.key, log_time, publish_time, payload
+    return None
+
+
+def _most_and_oldest(files: tuple[Path, ...]) -> tuple[int, float]:
+    """Return what sorts a run before its copies: the number of messages of known topics, and the age."""
+    counts = Counter[str]()
+    for path in files:
+        counts += count_by_key(path)
+    return -sum(count for key, count in counts.items() if topic_of(key)), files[0].stat().st_mtime
+
+
 def _run_of(path: Path) -> tuple[Path, str]:
     """Return the folder of a file's run, without links, and the run's name."""
     return path.parent.resolve(), number_of(path)[0]
 
 
 def open_log(paths: Paths) -> Log:
-    """Open the logs at `paths`, one or more files or folders.
+    """Open the logs at `paths`, one or more files or folders, without copies of a run in its folder.
 
     Raises:
         LogError: a path has no log; or, while iterating, a file is not an MCAP file.
     """
-    return Log(find(paths))
+    return Log(without_copies(find(paths)))
 
 
 def read(paths: Paths) -> Iterator[Record]:

@@ -251,7 +251,7 @@ def _rates(bins: list[Figures], counted: str, over: str, grid: Array, window: fl
     """Return the rate over the window before each step of the grid; NaN after the end, or if nothing ended in it."""
     ends = np.concatenate([[0.0], np.cumsum([row["steps"] for row in bins])])
     above = np.concatenate([[0.0], np.cumsum([_count(row, counted) for row in bins])])
-    below = np.concatenate([[0.0], np.cumsum([row[over] for row in bins])])
+    below = np.concatenate([[0.0], np.cumsum([0.0 if row.get(counted, 0.0) is None else row[over] for row in bins])])
     start = np.maximum(grid - window, 0.0)
     total = np.interp(grid, ends, below) - np.interp(start, ends, below)
     with np.errstate(invalid="ignore", divide="ignore"):

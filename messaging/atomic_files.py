@@ -10,13 +10,14 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, payload: bytes) -> None:
-    """Write a file and create its folders. Of several concurrent writers, the last one wins.
+    """Write a file and create its folders. Of several concurrent writers, the last one wins. A link stays a link.
 
     Raises:
         OSError: the file cannot be written; its old content stays.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, payload, 0o666)
+    target = Path(os.path.realpath(path))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _replace(target, payload, 0o666)
 
 
 @contextmanager

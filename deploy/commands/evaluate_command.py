@@ -37,8 +37,8 @@ class EvaluateCommand:
     seed: options.Seed = 0
     render: Path | None = None
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif or .mp4)."""
-    episode: int = 0
-    """With --render, draw the episode of this number."""
+    episode: int | None = None
+    """With --render, draw the episode of this number. Defaults to 0."""
     beside: bool = False
     """With --render, draw the same episode without the filter beside it."""
     engine: options.Unprefixed[Engine] = field(default_factory=Engine)
@@ -47,6 +47,7 @@ class EvaluateCommand:
     json: options.Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "logs")
+    least: ClassVar[dict[str, float]] = {"episode": 0}
 
     def run(self) -> int:
         """Drive the episodes and print the figures. Returns the exit status."""
@@ -56,6 +57,8 @@ class EvaluateCommand:
 
         if self.beside and self.render is None:
             raise ValueError("--beside draws an episode: give --render FILE too")
+        if self.episode is not None and self.render is None:
+            raise ValueError("--episode chooses the episode to draw: give --render FILE too. --seed changes the others")
         if self.render is not None:
             from brakeline.deploy.run.episode_render import check_ending
 
@@ -89,11 +92,11 @@ class EvaluateCommand:
         from brakeline.deploy.experiments.evaluate import prepare_evaluation
         from brakeline.deploy.run.episode_render import record, save
 
-        films = []
+        films, number = [], self.episode or 0
         for method in (evaluation.method, "none") if self.beside else (evaluation.method,):
             driver, policy, ask = prepare_evaluation(robot, replace(evaluation, method=method))
-            film = record(driver, policy, ask, self.episode)
+            film = record(driver, policy, ask, number)
             films.append(film)
             outcome = f"{film.end} after {len(film.frames) * robot.period:.1f} s"
-            errors.print(f"{path}: episode {self.episode}, method {method}, {outcome}")
+            errors.print(f"{path}: episode {number}, method {method}, {outcome}")
         save(films, path)

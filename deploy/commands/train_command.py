@@ -135,11 +135,13 @@ class TrainCommand(RunConfig):
 
     def run(self) -> int:
         """Run the training. Returns the exit status."""
-        from brakeline.logs.reader import find
-
         folder, config = self.resume or self.out or dated_folder(), self.config()
         if config.from_logs:
-            find(config.from_logs)  # a mistyped path ends the command before it starts a process
+            from brakeline.deploy.run.log_feed import check_logs
+            from brakeline.messaging.task import robot_with_task
+
+            for name in config.robots:  # a mistyped path ends the command before it starts a process
+                check_logs(config.from_logs, robot_with_task(name))
         return train(config, folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
 
 

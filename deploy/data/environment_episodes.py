@@ -61,8 +61,9 @@ def collect(
         held: largest number of periods for which an input is held: enough to reach the top speed.
         state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
         actions: mapping between actions and inputs, as in `SafetyWrapper`.
-        chord_deviation: largest distance in m of the path from its chord within a period, if `info` has no `subsamples`
-            and `turned`. Defaults to twice the value that follows from the recorded accelerations.
+        chord_deviation: largest distance in m of the path from the straight lines between the positions in
+            `info["subsamples"]`, or without them from the one over the period. Defaults to twice the value that
+            follows from the recorded accelerations.
         options: options of every `reset`.
         shown: whether to show progress on the terminal.
 
@@ -109,14 +110,13 @@ def _drive(
 
 
 def _chord_deviation(robot: Robot, trajectories: list[Trajectory]) -> float:
-    """Return 0 if positions within periods are recorded; otherwise twice a·T²/8 [m].
+    """Return twice a·(T/S)²/8 [m] for S positions in each period T, the largest of all trajectories.
 
-    A path with acceleration a leaves its chord by a·T²/8 within a period T. The second differences of the positions
-    are a·T².
+    A path with acceleration a leaves its chord by a·t²/8 within a time t. The second differences of the positions are
+    a·T².
     """
-    sampled = any(t.paths.shape[1] > 1 for t in trajectories)
-    sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
-    return 0.0 if sampled else max((float(size.max()) for size in sizes), default=0.0) / 4.0
+    longest = ((bends(robot, t.states).max(), t.paths.shape[1]) for t in trajectories if len(t.inputs) > 1)
+    return max((float(bend) / (4.0 * samples**2) for bend, samples in longest), default=0.0)
 
 
 def _ignore(by: int = 1, what: str | None = None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
         else:
             others[record.key] += 1
     for text in dict.fromkeys(described):
-        _check_described(path, robot, text)
+        check_described(path, robot, text)
     damage = "".join(f"; {cut}" for cut in log.cuts)
     trajectories, repeats = without_repeats(robot, tuple(trajectories_of(steps, robot)))
     if not trajectories:
@@ -57,13 +57,17 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
     return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{left_out}{damage}"
 
 
-def _check_described(path: Path, robot: Robot, text: str) -> None:
-    """Raise BadData if a description, as JSON text in a log, has other columns or another period than the robot."""
+def check_described(path: Path, robot: Robot, text: str, more: Mapping[str, str] = {}) -> None:
+    """Raise BadData if a description, as JSON text in a log, has other columns or another period than the robot.
+
+    Args:
+        more: further fields of the robot that must not differ, and a word for each.
+    """
     try:
         recorded = robot_from_description(parse_json(text))
     except ValueError:  # an old log has no description
         return
-    parts = {"period": "period", "state": "coordinates", "action": "inputs", "heading": "heading"}
+    parts = {"period": "period", "state": "coordinates", "action": "inputs", "heading": "heading", **more}
     if changed := [word for name, word in parts.items() if getattr(recorded, name) != getattr(robot, name)]:
         raise BadData(
             f"{path} was recorded with another description of {robot.name}: {', '.join(changed)} differ. Get the "

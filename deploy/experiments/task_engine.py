@@ -56,13 +56,17 @@ def unsaid(name: str, text: str) -> None:
 
 @dataclass(frozen=True)
 class Engine:
-    """Choose where the parts of a study run."""
+    """Choose where the parts of a study run. Raises ValueError: there is no worker."""
 
     workers: int = 1
     """Use this many processes of this machine at once, each on one core."""
     ray: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = ""
     """Use a Ray cluster instead: local starts one on this machine, auto takes the running one, and HOST:PORT takes the
     one at this address. A part whose machine dies runs again. You need the extra ray."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise ValueError(f"--workers is a number from 1 on, not {self.workers}")
 
     def completed(self, tasks: Sequence[T], runs: Path, say: Say) -> Iterator[tuple[T, Any]]:
         """Run tasks, and yield each with its result once it is there.

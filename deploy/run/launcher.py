@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
+from brakeline.deploy.run.resumption import check_resumable
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
 from brakeline.deploy.run.run_lock import only_launcher
@@ -19,9 +20,6 @@ from brakeline.deploy.run.run_models import models_of_new_run, models_of_resumed
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
 from brakeline.deploy.run.verdict import LatestEpisodes
 from brakeline.errors import LaunchError, LogError
-from brakeline.learner.checkpoint import CHECKPOINT
-from brakeline.learner.checkpoint import exists as checkpoint_exists
-from brakeline.learner.checkpoint import latest as latest_checkpoint
 from brakeline.logs.json_values import finite
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import count_by_key
@@ -59,7 +57,8 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         The configuration to run: of a new run, with the mode of its model sets.
 
     Raises:
-        LaunchError: the folder holds another run, or the run to resume has lost its checkpoint.
+        LaunchError: the folder holds another run. Or the run to resume has lost its checkpoint, or has more steps than
+            `config`.
         DamagedPart: the checkpoint of the run to resume is lost in part.
         BadModel: the folder of a resumed run lacks a model, or a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
@@ -70,8 +69,8 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
     _check_packages(config)
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
-    if resume and not config.policy and not config.from_logs:
-        _check_resumable(config, folder)
+    if resume and not config.policy:
+        check_resumable(config, folder)
     if config.conditions.unusual:
         _check_conditions(config)
     models: list[Model] = []
@@ -100,24 +99,6 @@ def _check_conditions(config: RunConfig) -> None:
 
     for robot in config.robots:
         simulated_vehicle(robot_with_task(robot), config.conditions)
-
-
-def _check_resumable(config: RunConfig, folder: Path) -> None:
-    """Check that each learner of the run has a checkpoint, so that none begins anew without a word.
-
-    Raises:
-        LaunchError: a learner has none.
-        DamagedPart: it is lost in part.
-    """
-    for spec in process_specs(config):
-        root = folder / spec.name / CHECKPOINT
-        if spec.kind == "learner" and not checkpoint_exists(root):
-            raise LaunchError(
-                f"{folder}: there is no checkpoint in {root}. Learn again from the run's log: `brakeline train "
-                f"--resume {folder} --from-logs {folder}`. Or begin anew in another folder: --out"
-            )
-        if spec.kind == "learner":
-            latest_checkpoint(root)
 
 
 class Launcher:

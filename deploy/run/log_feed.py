@@ -13,10 +13,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from brakeline.actors.learner_client import LearnerClient
+from brakeline.deploy.data.run_dataset import check_described
 from brakeline.errors import BadStep
 from brakeline.learner.step_ledger import StepLedger
 from brakeline.learner.transition_reader import StepReader
-from brakeline.logs.reader import by_run, find, open_log
+from brakeline.logs.reader import Log, by_run, find, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
@@ -25,6 +26,8 @@ from brakeline.messaging.topics import LOGGED
 
 log = logging.getLogger("brakeline.feeder")
 
+# Observations and actions of steps are shares of these. A word for each.
+SCALES = {"action_low": "lower bounds of inputs", "action_high": "upper bounds of inputs"}
 LAST_UPDATES_TIMEOUT = 10.0  # s for the updates that the learner makes after the last step
 
 
@@ -58,6 +61,7 @@ class LoggedSteps:
     reason: str = ""
 
     def __iter__(self) -> Iterator[pb.Step]:
+        check_logs(self.logs, self.robot)
         intake, known = StepReader(self.robot), set[tuple[str, int, int]]()
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
             ledger, sessions, copied = StepLedger(), _Sessions(), dict[tuple[str, int], bool]()
@@ -84,6 +88,19 @@ class LoggedSteps:
                     step.actor = f"{step.actor}.run{number}"
                 yield step
             self.damage += log_of_run.damage.lines
+
+
+def check_logs(logs: Sequence[str], robot: RobotWithTask) -> None:
+    """Check that a learner can use the steps of a robot in logs: another description gives steps another meaning.
+
+    Raises:
+        LogError: a path is no log.
+        BadData: a file was recorded with another description of the robot.
+    """
+    for path in find(logs):
+        log_file = Log((path,))
+        next(log_file.rows(), None)  # metadata precede the first message
+        check_described(path, robot, log_file.metadata.get("robots", {}).get(robot.kind, ""), SCALES)
 
 
 def _is_copied(step: pb.Step, copied: dict[tuple[str, int], bool], known: set[tuple[str, int, int]]) -> bool:
@@ -124,6 +141,7 @@ def count(logs: Sequence[str], robot: RobotWithTask) -> int:
 
     Raises:
         LogError: a path is no log.
+        BadData: a file was recorded with another description of the robot.
         ValueError: the logs have no steps of this robot, or none that teaches anything.
     """
     steps, named = LoggedSteps(logs, robot), ", ".join(map(str, logs))
@@ -157,6 +175,7 @@ def main(settings: FeederSettings) -> bool:
     Raises:
         RefusedByLearner: the learner does not accept the actors of the log.
         LogError: a path is no log.
+        BadData: a file was recorded with another description of the robot.
     """
     with Process(settings.bus, settings.name) as process:
         return _feed(process, settings)

@@ -38,7 +38,9 @@ def run_totals(metrics: Metrics) -> Totals:
             counts = totals.setdefault(stats.robot, dict.fromkeys(COUNTS, 0.0))
             returns = stats.returns[:]
             counts["episodes"] += len(returns)
-            counts["reward"] += math.fsum(returns)
+            # An episode of which a part is missing counts with the mean of the others.
+            whole = [value for value in returns if math.isfinite(value)]
+            counts["reward"] += math.fsum(whole) * len(returns) / max(1, len(whole))
             for name in ("steps", "goals", "collisions", "interventions", "failsafes"):
                 counts[name] += getattr(stats, name)
     return totals

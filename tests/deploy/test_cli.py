@@ -396,6 +396,8 @@ def test_show_prints_a_description(command, figures, robot):
         ),
         ("train --learner.td3.multiplier-rate 1e30", "--learner.td3.multiplier-rate is a number from"),
         ("fly --origin 0 0 -1e30", "--origin is a number from"),
+        ("evaluate ground --episode 3", "--episode chooses the episode to draw: give --render FILE too"),
+        ("evaluate ground --render a.png --episode -3", "--episode is a number from 0 on, not -3"),
         ("status --wait -1", "--wait is a number from 0 on, not -1"),
     ],
 )

@@ -15,6 +15,7 @@ import pytest
 import tyro
 
 from brakeline.deploy.cli import command_class
+from brakeline.deploy.experiments import task_engine
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -143,3 +144,9 @@ def test_container_has_every_package():
     copied = {word for line in lines if line.startswith("COPY") for word in line.split()[1:-1]}
     assert all((ROOT / name).exists() for name in copied)
     assert {"brakeline", *(link.name for link in (ROOT / "brakeline").iterdir() if link.is_symlink())} <= copied
+
+
+@pytest.mark.parametrize("workers", [0, -3])
+def test_there_is_at_least_one_worker(workers):
+    with pytest.raises(ValueError, match=f"--workers is a number from 1 on, not {workers}"):
+        task_engine.Engine(workers=workers)

@@ -227,13 +227,14 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
     for step in steps:
         episodes[step.actor, step.header.run, step.episode].append(step)
     ended = [part for part in episodes.values() if part[-1].terminated or part[-1].truncated]
+    whole = [part for part in ended if [s.step for s in part] == list(range(len(part)))]
     failsafe = [s for s in steps if s.fallback or s.decision == 3]
     answered = [e for e in exchanges if not e.failure]
     kinds = {"allowed": 1, "adjusted": 2, "failsafe": 3, "recovering": 4}
     inside = {
         name: [s.decide_ms for s in steps if s.decision == kind and not s.fallback] for name, kind in kinds.items()
     }
-    whole = [value for values in inside.values() for value in values]
+    times = [value for values in inside.values() for value in values]
     solved = [e.reply.decision for e in answered if e.reply.decision.solver]
     tubes = [e.reply.decision for e in answered if len(e.reply.decision.tube_half_width)]
     return {
@@ -254,14 +255,14 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
         "fallbacks": sum(s.fallback for s in steps),
         "mean_speed": float(np.mean([s.speed for s in steps])),
         "max_speed": max(s.speed for s in steps),
-        "mean_reward": float(np.mean([sum(s.reward for s in part) for part in ended])),
+        "mean_reward": float(np.mean([sum(s.reward for s in part) for part in whole])),
         "outside": sum(s.outside for s in steps),
         "containment": {
             "steps": sum(s.compared for s in steps), "violations": sum(s.compared and not s.contained for s in steps)
         },
         "closest_approach": min(least_clearance(s) for s in steps),
         "clearance": percentiles([s.clearance for s in steps]),
-        "decision_ms": _short(whole) | {name: _short(values) for name, values in inside.items()},
+        "decision_ms": _short(times) | {name: _short(values) for name, values in inside.items()},
         "round_trip_ms": _short([e.round_trip_ms for e in answered]),
         "no_decision": dict(Counter(e.failure.split(":")[0] for e in exchanges if e.failure)),
         "latency_ms": {name: _latency(answered, kind) for name, kind in kinds.items()},

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import tracemalloc
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,9 +14,10 @@ from brakeline.logs.episode_sampler import MOST_STEPS, SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve, interventions_in
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
+from brakeline.logs.log_export import to_foxglove
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
-from brakeline.logs.reader import Log, by_run, find
+from brakeline.logs.reader import Log, by_run, find, read
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import (
     ABOUT,
@@ -312,12 +314,31 @@ def test_curves_count_the_interventions_and_collisions_that_the_summary_counts()
     assert interventions_in(before) == pytest.approx(0.4), "a row that an earlier version wrote"
 
 
+@pytest.mark.parametrize("name", ["backup.mcap", "zz.mcap"])
+def test_a_copy_of_a_log_in_its_folder_counts_once(tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+    """A backup, and a longer copy with pictures; the run itself has two files. Another run in the folder counts."""
+    mixed(tmp_path, episodes=4)
+    alone = analyse_runs(tmp_path).figures()
+    shutil.copy(tmp_path / "run.mcap", tmp_path / name)
+    to_foxglove(Log(find(tmp_path / "run.mcap")), tmp_path / "pictures.mcap")
+    figures = analyse_runs(tmp_path).figures()
+    assert list(figures["runs"]) == [tmp_path.name]
+    assert {**figures, "segments": None} == {**alone, "segments": None}
+    assert f"{name} is a copy of" in caplog.text and "run.mcap is a copy" not in caplog.text
+    assert sum(1 for _ in read(tmp_path)) == sum(1 for _ in read(tmp_path / "run.mcap"))
+    shutil.copy(mixed(tmp_path / "other", seed=1, episodes=2) / "run.mcap", tmp_path / "other.mcap")
+    both = analyse_runs(tmp_path).figures()
+    assert len(both["runs"]) == 2 and both["steps"] > alone["steps"]
+
+
 def test_a_cut_episode_is_not_joined_with_the_next_one_whose_first_step_is_lost() -> None:
     curve = LearningCurve()
     for episode, numbers in ((0, range(5)), (1, range(1, 10))):
         for k in numbers:
-            curve.step(pb.Step(actor="a", episode=episode, step=k, reward=1.0, terminated=(episode, k) == (1, 9)))
-    assert curve.figures()["last"]["reward"] == 9.0
+            kind = pb.ALLOWED if episode else pb.ADJUSTED
+            curve.step(pb.Step(actor="a", episode=episode, step=k, decision=kind, terminated=(episode, k) == (1, 9)))
+    last = curve.figures()["last"]
+    assert (last["episodes"], last["interventions"], last["reward"]) == (1, 0.0, None)
 
 
 def test_a_change_shows_in_the_windows_the_widening_the_widths_and_the_model_sets() -> None:

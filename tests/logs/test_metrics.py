@@ -4,6 +4,9 @@ import itertools
 import math
 import random
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
@@ -11,6 +14,7 @@ from brakeline.logs.figure_tables import for_clearance, show
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.run_plots import draw
+from brakeline.logs.watch.run_history import run_totals
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from tests.logs.conftest import Say
@@ -57,6 +61,32 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
     assert (figures["adjusted"], figures["for_clearance"]) == (1, None)
     assert closed_loop([new, old])["for_clearance"] is None and closed_loop([])["for_clearance"] == 0
     assert for_clearance(figures) == "not recorded by this method or version"
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_the_mean_reward_leaves_out_episodes_of_which_the_log_lacks_a_part(indexed: bool) -> None:
+    """Missing: the middle of episode 1, and the beginning of episode 2. All of them reached the goal."""
+    steps = [step for number in range(4) for step in episode(number, [pb.ALLOWED] * 3, terminated=True, goal=True)]
+    for index, step in enumerate(steps, 1):
+        step.index = index if indexed else 0
+    stats, curve = EpisodeStats(), LearningCurve()
+    for number, step in enumerate(steps):
+        if number not in (4, 6):
+            stats.step(step)
+            curve.step(step)
+    figures, (row,) = closed_loop([stats]), curve.figures()["bins"]
+    assert (figures["episodes"], figures["goals"], figures["mean_reward"]) == (4, 4, 3.0)
+    assert (row["episodes"], row["goals"], row["reward"]) == (4, 1.0, 3.0)
+    assert curve.figures()["last"]["reward"] == 3.0
+    assert run_totals(SimpleNamespace(actors={"a": stats}))["ground"]["reward"] == 4 * 3.0  # type: ignore[arg-type]
+
+
+def test_a_period_without_an_observation_takes_nothing_from_an_episode() -> None:
+    """In real time a late observation leaves out a number of a step, and no index."""
+    stats = EpisodeStats()
+    for index, number in ((1, 1), (2, 4)):
+        stats.step(pb.Step(actor="a", robot="ground", index=index, step=number, reward=1.0, truncated=index == 2))
+    assert closed_loop([stats])["mean_reward"] == 2.0
 
 
 def test_without_steps_and_without_a_filter_there_are_no_numbers() -> None:

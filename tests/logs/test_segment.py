@@ -75,9 +75,8 @@ def test_names_of_segments() -> None:
 
 def test_logs_named_by_date_are_runs_of_their_own(tmp_path: Path, say: Say) -> None:
     """The number in the file decides, not one in its name; many missing numbers are one line."""
-    line = [say("log/a", pb.LogLine(text="x"))]
     for name in ("log_20260101", "log_20260101", "flight_2025", "flight_2026", *["run"] * 9):
-        write(tmp_path / f"{name}.mcap", line)
+        write(tmp_path / f"{name}.mcap", [say("log/a", pb.LogLine(text=name))])
     found = {label: [path.name for path in paths] for label, paths in by_run(find(tmp_path)).items()}
     place = tmp_path.name
     assert found[f"{place}/log_20260101"] == ["log_20260101.mcap", "log_20260101_0001.mcap"]

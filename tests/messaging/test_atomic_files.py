@@ -32,6 +32,19 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path, monkeypatc
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
 
 
+def test_a_link_stays_a_link_and_its_target_is_written(tmp_path: Path) -> None:
+    """Such as a file on a shared volume. A secret replaces the link, which somebody else may have put there."""
+    (tmp_path / "shared").mkdir()
+    for name in ("there", "new"):
+        (tmp_path / name).symlink_to(Path("shared") / name)
+    (tmp_path / "shared" / "there").write_bytes(b"before")
+    for name in ("there", "new"):
+        write_atomically(tmp_path / name, b"after")
+        assert (tmp_path / name).is_symlink() and (tmp_path / "shared" / name).read_bytes() == b"after"
+    write_secret(tmp_path / "there", b"secret")
+    assert not (tmp_path / "there").is_symlink() and (tmp_path / "shared" / "there").read_bytes() == b"after"
+
+
 def test_a_secret_is_its_owners_also_where_it_was_not_before(tmp_path: Path) -> None:
     path = tmp_path / "keys" / "secret"
     write_atomically(path, b"everybody's")

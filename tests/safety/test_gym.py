@@ -23,7 +23,7 @@ from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.in_process import InProcess
 from brakeline.sim.registration import ENVIRONMENTS, register
-from tests.safety.toys import Toy, car, discs, near, puck, seen
+from tests.safety.toys import SUBSTEPS, Toy, car, discs, near, puck, seen
 
 CAR, PUCK = car("gym-car"), puck("gym-puck")
 HOW = {"state": seen, "obstacles": near, "actions": normalised(CAR)}
@@ -504,6 +504,25 @@ def test_collecting_copies_what_the_environment_writes_again():
 
     data = collect(Buffered(CAR), CAR, 20, state=seen, actions=normalised(CAR), shown=False)
     assert list(data.trajectories[0].paths[:, 0, 0]) == list(range(1, 21))
+
+
+@pytest.mark.parametrize("samples", [1, 2, 5])
+def test_collecting_states_how_far_the_path_leaves_the_lines_between_the_samples(samples):
+    class Sampled(Toy):
+        def step(self, action):
+            before, number = self.state[:2], len(self.trace)
+            *result, info = super().step(action)
+            path = np.array(self.trace[number:])[:, :2] - before
+            return *result, info | {"subsamples": path[len(path) // samples - 1 :: len(path) // samples]}
+
+    env = Sampled(PUCK)
+    data = collect(env, PUCK, 60, held=2, state=seen, actions=normalised(PUCK), shown=False)
+    assert data.trajectories[0].paths.shape[1] == samples
+    corners = np.vstack([np.zeros((1, 2)), np.array(env.trace)[:, :2]])
+    per, share = SUBSTEPS // samples, np.linspace(0.0, 1.0, SUBSTEPS // samples + 1)[:, None]
+    chords = [corners[i : i + per + 1] for i in range(0, len(corners) - 1, per)]
+    away = max(np.linalg.norm(c - c[0] - share * (c[-1] - c[0]), axis=1).max() for c in chords)
+    assert 0.0 < away <= data.chord_deviation < 6.0 * away
 
 
 def test_collecting_gives_up_if_every_episode_ends_at_once():

@@ -25,6 +25,12 @@ SEPARATORS = (";", "\t", "|", ",", " ")  # a comma may be a decimal mark, and a 
 EXCEL = re.compile(r"\s*\"?sep=.?\"?\s*", re.IGNORECASE)  # a first line that tells Excel the separator
 COMMENT = re.compile(r"\s*(?:#|%|//)")
 NUMBER = re.compile(r"\s*\"?[-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[-+]?\d+)?\"?\s*", re.IGNORECASE)
+SPACES = " '\u2019\u00a0\u202f"  # that some programs write between thousands
+# Numbers with a mark or a space between thousands, by their decimal mark.
+GROUPED = {
+    decimal: re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:[{other}{SPACES}]\d{{3}})+(?:{decimal}\d*)?")
+    for decimal, other in ((",", "."), (".", ","))
+}
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")  # in any case: a cell without a value
 DAMAGED = 0.01  # largest share of lines, or of a column's cells, that is left out
 SAMPLE = 200  # lines that decide on the dialect
@@ -115,9 +121,8 @@ def _dialect(path: Path) -> _Dialect:
         rows = [(i, " ".join(line.split())) for i, line in rows]
         sample = [line for _, line in rows[:SAMPLE]]
     width = Counter(len(_cells(line, separator)) for line in sample[1:] or sample).most_common(1)[0][0]
-    numbers = [cell for line in sample for cell in _cells(line, separator) if NUMBER.fullmatch(cell)]
-    commas = sum("," in cell for cell in numbers) > sum("." in cell for cell in numbers)
-    decimal = "," if separator != "," and commas else "."
+    sample_cells = [cell for line in sample for cell in _cells(line, separator)]
+    decimal = "." if separator == "," else _decimal_mark(sample_cells)
     names = _cells(rows[0][1], separator)
     digits = sum(bool(NUMBER.fullmatch(cell)) for cell in names)
     if digits >= 0.5 * len(names) or all(NUMBER.fullmatch(cell) or cell.lower() in MISSING for cell in names):
@@ -146,6 +151,20 @@ def _dialect(path: Path) -> _Dialect:
     if not rows:
         raise NoSource(f"{path}: the file has a header, but no whole row of numbers")
     return _Dialect(separator, decimal, _unique(names), [line for _, line in rows], [i for i, _ in rows], notes)
+
+
+def _decimal_mark(cells: list[str]) -> str:
+    """Return the decimal mark of most numbers. One that may be a mark between thousands counts only without others."""
+    marks, unsure = Counter[str](), Counter[str]()
+    for cell in cells:
+        dots, commas = cell.count("."), cell.count(",")
+        grouped = {mark for mark, form in GROUPED.items() if form.fullmatch(cell)}
+        if grouped and ((dots and commas) or dots + commas > 1):
+            marks.update(grouped)
+        elif NUMBER.fullmatch(cell) and dots + commas:
+            (unsure if grouped else marks)["," if commas else "."] += 1
+    marks = marks or unsure
+    return "," if marks[","] > marks["."] else "."
 
 
 def _text(path: Path) -> tuple[str, bool]:
@@ -219,10 +238,16 @@ def _numbers(column: arrow.ChunkedArray, decimal: str, lines: np.ndarray) -> tup
     if not (arrow.types.is_string(kind) or arrow.types.is_time(kind)):
         return np.asarray(column.to_numpy(), float), ""
     cells = ["" if cell is None else str(cell).strip() for cell in column.to_pylist()]
-    values, bad = np.full(len(cells), np.nan), []
+    values, bad, thousands = np.full(len(cells), np.nan), [], _thousands(cells, decimal)
+    if thousands is None:
+        i = next(i for i, cell in enumerate(cells) if GROUPED[decimal].fullmatch(cell))
+        return None, (
+            f"line {lines[i]}: {cells[i]} has a mark between thousands, or another decimal mark than other columns: "
+            "the column is left out. Write the file without marks between thousands"
+        )
     for i, cell in enumerate(cells):
         try:
-            values[i] = _number(cell, decimal)
+            values[i] = _number(cell, decimal, thousands)
         except ValueError:
             bad.append(i)
     if not bad:
@@ -232,10 +257,30 @@ def _numbers(column: arrow.ChunkedArray, decimal: str, lines: np.ndarray) -> tup
     return values, f"{_listed([int(lines[i]) for i in bad])}: no number ({cells[bad[0]]!r}): the cell is left out"
 
 
-def _number(cell: str, decimal: str) -> float:
-    """Return the number in a cell; of a date or a time (ISO 8601) its seconds. Raises ValueError for other text."""
+def _thousands(cells: list[str], decimal: str) -> bool | None:
+    """Return whether the numbers of a column have marks or spaces between thousands; None: nobody can tell.
+
+    1.234 may be 1234 in a file with decimal commas, or a number of a column with decimal points.
+    """
+    grouped = [cell for cell in cells if GROUPED[decimal].fullmatch(cell)]
+    other = "." if decimal == "," else ","
+    if any(cell.count(other) != 1 or decimal in cell for cell in grouped):
+        return True
+    one_mark = re.compile(rf"[-+]?(?:0|\d+{other}(?!\d{{3}}$)|\d{{4,}}{other}).*")
+    return None if grouped and not any(other in cell and one_mark.fullmatch(cell) for cell in cells) else False
+
+
+def _number(cell: str, decimal: str, thousands: bool = False) -> float:
+    """Return the number in a cell; of a date or a time (ISO 8601) its seconds. Raises ValueError for other text.
+
+    thousands: there may be marks or spaces between thousands, so that such a mark is no decimal one.
+    """
     if cell.lower() in MISSING:
         return math.nan
+    if thousands and GROUPED[decimal].fullmatch(cell):
+        return float(re.sub(rf"[^-+\d{decimal}]", "", cell).replace(decimal, "."))
+    if thousands and decimal == "," and "." in cell:
+        raise ValueError(f"{cell} has another decimal mark than other cells of its column")
     if ":" not in cell:
         return float(cell.replace(decimal, "."))
     if "-" in cell:

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from brakeline.deploy import progress
 from brakeline.deploy.cli import main
+from brakeline.deploy.data.sources.csv_file import read
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.dataset import Dataset
 from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, driven_by, write_csv
@@ -388,6 +389,29 @@ def test_rows_out_of_order_are_sorted(driven, plain, tmp_path, capsys):
     path = write_csv(tmp_path / "late.csv", time[order], values[order])
     same(plain, imported(path), 1e-9)
     assert "1 rows are out of order" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    "cells, numbers",
+    [
+        ({"t": ("999,5", "1.000,5"), "x": ("0,5", "-1,5")}, {"t": [999.5, 1000.5], "x": [0.5, -1.5]}),
+        ({"t": ("1.234.567", "1.234.568"), "x": ("0,5", "1,5")}, {"t": [1234567.0, 1234568.0], "x": [0.5, 1.5]}),
+        ({"t": ("1,000.5", "-2,000.25"), "x": ("0.5", "1.5")}, {"t": [1000.5, -2000.25], "x": [0.5, 1.5]}),
+        ({"t": ("1 000,5", "1\u202f001,5"), "x": ("0,5", "1,5")}, {"t": [1000.5, 1001.5], "x": [0.5, 1.5]}),
+        ({"t": ("1.000,5", "1.001,5"), "x": ("2.000,5", "3.000,5")}, {"t": [1000.5, 1001.5], "x": [2000.5, 3000.5]}),
+        ({"t": ("0.999", "1.000"), "x": ("0,5", "1,5")}, {"t": [0.999, 1.0], "x": [0.5, 1.5]}),
+        ({"t": ("0.999", "1.000"), "x": ("1.125", "2.125")}, {"t": [0.999, 1.0], "x": [1.125, 2.125]}),
+        ({"t": ("999", "1.000"), "x": ("0,5", "1,5")}, {"x": [0.5, 1.5]}),  # nobody can tell
+    ],
+)
+def test_marks_between_thousands(tmp_path, cells, numbers):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([";".join(cells), *map(";".join, zip(*cells.values(), strict=True))]) + "\n")
+    (table,) = read(path)
+    assert {name: list(values) for name, values in table.columns.items()} == numbers
+    if numbers.keys() < cells.keys():
+        (note,) = table.notes
+        assert "column t, line 3: 1.000 has a mark between thousands, or" in note
 
 
 def test_damaged_lines_and_cells_are_named(driven, plain, tmp_path, capsys):

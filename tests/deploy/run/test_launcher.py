@@ -17,7 +17,7 @@ import pytest
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.launcher import Launcher, prepare
-from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec, write_endpoint
+from brakeline.deploy.run.processes import CONFIG, UNFINISHED, ProcessSpec, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
 from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.supervisor import SupervisedProcess
@@ -133,6 +133,21 @@ def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path)
     with pytest.raises(DamagedPart, match="latest"):
         prepare(config, tmp_path, resume=True)
     prepare(replace(config, from_logs=(str(tmp_path),)), tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("logs", [(), ("runs/a",)])
+def test_a_resumed_run_keeps_its_configuration_if_it_has_more_steps_than_are_asked_for(
+    tmp_path: Path, logs: tuple[str, ...]
+) -> None:
+    config = RunConfig(method="none", steps=5000, from_logs=logs)
+    (tmp_path / CONFIG).write_text(encode(config))
+    checkpoint.save(tmp_path / "learner" / CHECKPOINT, {}, {"steps": 5003})  # to the end of the last episode
+    with pytest.raises(LaunchError, match=r"has 5003 steps already, more than --steps 4000. To go on, give more"):
+        prepare(replace(config, steps=4000), tmp_path, resume=True)
+    for steps in (5000, 6000):
+        assert prepare(replace(config, steps=steps), tmp_path, resume=True).steps == steps
+    checkpoint.save(tmp_path / "learner" / CHECKPOINT, {}, {"steps": 3000})
+    prepare(replace(config, steps=4000), tmp_path, resume=True)  # ends earlier than planned
 
 
 def test_a_run_that_is_running_is_not_resumed_and_its_lock_ends_with_its_process(tmp_path: Path) -> None:

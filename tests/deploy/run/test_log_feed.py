@@ -1,13 +1,17 @@
 """Test the steps that a learner gets from logs, and the processes of a run that learns from logs."""
 
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.run.log_feed import LoggedSteps, count
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
+from brakeline.errors import BadData
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import STEP
 from tests.logs.sample_log import written
@@ -45,6 +49,24 @@ def test_unusable_steps_are_counted_and_left_out(tmp_path: Path) -> None:
     record(tmp_path / "own" / "run.mcap", *bad)
     with pytest.raises(ValueError, match=r"none of the 2 steps of ground .* \(observation: 1 values, not 26\)"):
         count([str(tmp_path / "own")], GROUND)
+
+
+def test_steps_of_another_description_teach_nothing(tmp_path: Path) -> None:
+    """A step of 0.1 s is none of 0.2 s, and speeds in an observation are shares of the largest one."""
+    recorded = [(STEP.at(robot="ground", source="a"), step(i), 1 + i) for i in range(3)]
+    former = (replace(GROUND, horizon=GROUND.horizon + 1), None), (replace(GROUND, period=0.1), "period")
+    for number, (robot, word) in enumerate((*former, (replace(GROUND, action_high=(1.0, 1.0)), "upper bounds"))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        written(folder / "run.mcap", recorded, {"robots": {"ground": json.dumps(robot.description)}})
+        if word is None:
+            assert count([str(folder)], GROUND) == 3
+            continue
+        with pytest.raises(BadData, match=rf"run.mcap was recorded with another description of ground: {word}"):
+            count([str(folder)], GROUND)
+        with pytest.raises(BadData, match=word):
+            TrainCommand(from_logs=(str(folder),), out=tmp_path / "new").run()
+        assert not (tmp_path / "new").exists()
 
 
 def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: Path) -> None:

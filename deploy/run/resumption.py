@@ -1,0 +1,40 @@
+"""Check that an interrupted training can go on."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from brakeline.deploy.run.processes import CONFIG, process_specs
+from brakeline.deploy.run.run_config import RunConfig, load
+from brakeline.errors import CheckpointError, LaunchError
+from brakeline.learner import checkpoint
+
+
+def check_resumable(config: RunConfig, folder: Path) -> None:
+    """Check that each learner of the run has a checkpoint, so that none begins anew without a word, and needs steps.
+
+    Args:
+        config: of the run that goes on. With other steps than in the folder, it replaces the configuration there.
+
+    Raises:
+        LaunchError: a learner has no checkpoint and gets no logs, or it has more steps than are asked for.
+        DamagedPart: the checkpoint is lost in part, and there are no logs.
+    """
+    stored = load(folder / CONFIG).steps if (folder / CONFIG).exists() else config.steps
+    for root in (
+        folder / spec.name / checkpoint.CHECKPOINT for spec in process_specs(config) if spec.kind == "learner"
+    ):
+        learned = 0
+        with suppress(*((CheckpointError,) if config.from_logs else ())):
+            if not config.from_logs and not checkpoint.exists(root):
+                raise LaunchError(
+                    f"{folder}: there is no checkpoint in {root}. Learn again from the run's log: `brakeline train "
+                    f"--resume {folder} --from-logs {folder}`. Or begin anew in another folder: --out"
+                )
+            learned = checkpoint.about_latest(root).get("steps", 0)
+        if config.steps < min(stored, learned):
+            raise LaunchError(
+                f"{folder}: the learner has {learned} steps already, more than --steps {config.steps}. To go on, give "
+                "more --steps; to see what came of it, `brakeline analyse`"
+            )
