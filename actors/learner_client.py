@@ -38,10 +38,8 @@ class LearnerClient:
         self._index = 0  # of the latest step that this actor waited for
         self._doubtful = False  # whether a message contradicts our learner, so that we have to join again
         self._changed = threading.Condition()
-        self._subscriptions = (
-            bus.subscribe(WEIGHTS, self._on_weights, robot=robot.name),
-            bus.subscribe(FLOW, self._on_flow, robot=robot.name),
-        )
+        bus.subscribe(WEIGHTS, self._on_weights, robot=robot.name)
+        bus.subscribe(FLOW, self._on_flow, robot=robot.name)
 
     @property
     def done(self) -> bool:

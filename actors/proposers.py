@@ -5,16 +5,21 @@ A proposer also says whether the robot may go on.
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.learner_client import LearnerClient
+from brakeline.actors.learner_client import LOG_INTERVAL, LearnerClient
+from brakeline.errors import RefusedByLearner
 from brakeline.messaging.robot import Array
 from brakeline.sim.scripted_policies import Policy, scripted
+
+log = logging.getLogger("brakeline.actor")
 
 Stop = Callable[[], bool]  # whether to end
 PolicyFactory = Callable[[int], Policy]  # makes a policy from a seed
@@ -50,9 +55,16 @@ class RealTimePolicy(LearnedPolicy):
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
         """Return False at the end of the run. Never waits."""
         if not self.joined and (self._joining is None or not self._joining.is_alive()):
-            self._joining = threading.Thread(target=self.join, args=(index - 1, episode, stop), daemon=True)
+            self._joining = threading.Thread(target=self._rejoin, args=(index - 1, episode, stop), daemon=True)
             self._joining.start()
         return not self.done
+
+    def _rejoin(self, index: int, episode: int, stop: Stop) -> None:
+        try:
+            self.join(index, episode, stop)
+        except RefusedByLearner as error:
+            log.error("the learner refuses %s, which goes on with its weights: %s", self.actor, error)
+            time.sleep(LOG_INTERVAL)  # it may be started again, as it should be
 
 
 class FixedPolicy:

@@ -101,8 +101,8 @@ def _row(
     asked = max(1, due - counts["skipped"])
     return {
         "due /s": due / SECONDS,
-        "answered /s": len(took) / SECONDS,
-        "in time %": 100.0 * len(took) / due,
+        "answered /s": len(answered) / SECONDS,
+        "in time %": 100.0 * len(answered) / due,
         "late or none %": 100.0 * (counts["late"] + counts["unanswered"]) / due,
         "never asked %": 100.0 * counts["skipped"] / due,
         "p50 ms": 1e3 * float(np.percentile(took, 50)),

@@ -13,7 +13,7 @@ from brakeline.messaging.robot import shipped_robots
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.mujoco_obstacles import HEIGHT, map_model
+from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles
 
 STEPS = 3000
 
@@ -43,6 +43,16 @@ def _steps(robot: RobotWithTask) -> tuple[dict[str, float], Arena]:
         seconds += perf_counter() - before
         running = not (terminated or truncated)
     return {"steps/s": STEPS / seconds, "reset ms": 1e3 * resets / episode}, info["arena"]
+
+
+def map_model(arena: Arena) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Compile the obstacles of an arena without a robot, to compare a lidar with MuJoCo's rays."""
+    spec = mujoco.MjSpec()
+    add_obstacles(spec, arena)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return model, data
 
 
 def _lidars(robot: RobotWithTask, arena: Arena) -> Figures:

@@ -200,7 +200,7 @@ def run() -> Figures:
         ways["the matrix products alone"] = products(config, observations + actions)
         rows = in_turn(ways, "torch.nn and torch.optim")
         figures |= {f"TD3 update, batch {size}: {name}": row for name, row in rows.items()}
-    mlp, seen = MLP.untrained(robot_with_task("ground"), 0), rng.uniform(-1, 1, observations).astype(np.float32)
+    mlp, seen = MLP.untrained(robot, 0), rng.uniform(-1, 1, observations).astype(np.float32)
     actor, tensor = Plain(TD3Config(), observations, actions).actor, torch.rand(1, observations)
     figures["policy forward, NumPy"] = timed(lambda: mlp(seen), 2000)
     with torch.no_grad():

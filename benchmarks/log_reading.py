@@ -74,14 +74,12 @@ def endless(messages: list[tuple[str, Any]]) -> Iterator[Entry]:
         rounds += 1
 
 
-def synthesise(path: Path, size: int) -> int:
-    """Write a log of `size` bytes. Returns the number of its messages."""
-    segment, entries, count = open_segment(path, {}), endless(real()), 0
+def synthesise(path: Path, size: int) -> None:
+    """Write a log of `size` bytes."""
+    segment, entries = open_segment(path, {}), endless(real())
     while segment.size < size:
         segment.save(islice(entries, PORTION))
-        count += PORTION
     segment.finish()
-    return count
 
 
 def measured(what: str, path: Path) -> dict[str, float]:

@@ -70,8 +70,7 @@ class Recording:
         robot, N = data.robot, data.robot.horizon
         plans = non_overlapping(windows(fresh, N, kind), N)
         z = plans.z if kind == FREE else plans.z @ plan_regressor_map(robot).T
-        states = [np.stack([fresh.trajectories[i].states[j : j + N + 1]]) for i, j in plans.start]
-        whole = np.concatenate(states)
+        whole = np.stack([fresh.trajectories[i].states[j : j + N + 1] for i, j in plans.start])
         after = np.stack([displacement(robot, whole[:, 0], whole[:, k]) for k in range(1, N + 1)], axis=1)
         return Recording(name, data, kind, z, after[..., : robot.position_dim])
 

@@ -94,7 +94,6 @@ def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
     """Set parameters, and wait until the autopilot has saved them. Raises NoAutopilot if it refuses one."""
     link = open_link(url)
     client = AutopilotClient(link.send, system)
-
     try:
         wait = connected(link, client)
         for name, value in parameters.items():

@@ -68,19 +68,15 @@ class TD3Config:
 
     def __post_init__(self) -> None:
         check_numbers(self, "actor_rate", "critic_rate", "target_noise", "target_noise_clip", least=0.0)
-        check_numbers(self, "exploration_noise", "multiplier_rate", "updates_per_step", least=0.0)
-        check_numbers(self, "reward_scale", above=0.0)
-        widths = min(self.hidden, default=0)
-        if min(self.batch, self.n_step, self.policy_delay, self.updates_per_step, widths) <= 0:
-            raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")
+        check_numbers(self, "exploration_noise", "imitation", least=0.0)
+        check_numbers(self, "penalty_growth", least=1.0)
+        check_numbers(self, "reward_scale", "updates_per_step", "multiplier_rate", above=0.0)
+        if min(self.batch, self.n_step, self.policy_delay, min(self.hidden, default=0)) <= 0:
+            raise ValueError(f"batch, n_step, policy_delay and hidden must be positive: {self}")
         if self.warmup < self.n_step:
             raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
-        if not 0.0 <= self.imitation < float("inf"):
-            raise ValueError(f"imitation must be 0 or a positive weight, not {self.imitation:g}")
-        if not 1.0 <= self.penalty_growth < float("inf"):
-            raise ValueError(f"penalty_growth must be 1 or more, not {self.penalty_growth:g}")
-        if self.multiplier_rate <= 0.0 or not 0.0 <= (self.cost_limit or 0.0) < 1.0:
-            raise ValueError(f"multiplier_rate must be positive and cost_limit in [0, 1): {self}")
+        if not 0.0 <= (self.cost_limit or 0.0) < 1.0:
+            raise ValueError(f"cost_limit must be in [0, 1): {self}")
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
             raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
 

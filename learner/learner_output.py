@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from brakeline.errors import CheckpointError
@@ -24,16 +23,14 @@ RETRY = 30.0  # time to the next attempt after a failed checkpoint [s]
 class LearnerOutput:
     """Writes the files of one learner to a folder, and publishes its metrics. A full disk does not end the run."""
 
-    def __init__(
-        self, process: Process, learner: Learner, out: Path, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._process, self._learner, self._out, self._clock = process, learner, out, clock
+    def __init__(self, process: Process, learner: Learner, out: Path) -> None:
+        self._process, self._learner, self._out = process, learner, out
         self._metrics = process.bus.publisher(LEARNER, robot=learner.robot.name)
         self._metrics_at = self._retry_at = -1e9
 
     def save_if_due(self) -> None:
         """Write a checkpoint and the policy if it is time. Raises Diverged, as `save`."""
-        if self._learner.checkpoint_due() and self._clock() > self._retry_at:
+        if self._learner.checkpoint_due() and time.monotonic() > self._retry_at:
             self.save()
 
     def save(self) -> None:
@@ -47,7 +44,7 @@ class LearnerOutput:
             self._process.notes["checkpoint"] = f"step {self._learner.steps}"
             log.info("checkpoint of step %d in %s", self._learner.steps, place)
         except CheckpointError as error:
-            self._retry_at = self._clock() + RETRY
+            self._retry_at = time.monotonic() + RETRY
             self._process.notes["checkpoint"] = str(error)
             log.error("%s", error)
         self.write_policy()
@@ -66,11 +63,11 @@ class LearnerOutput:
 
     def publish_if_due(self, waiting: int = 0) -> None:
         """Publish the metrics if it is time. waiting: number of steps that the process has not taken in."""
-        if self._clock() - self._metrics_at > METRICS_PERIOD:
+        if time.monotonic() - self._metrics_at > METRICS_PERIOD:
             self.publish(waiting)
 
     def publish(self, waiting: int = 0) -> None:
-        self._metrics_at = self._clock()
+        self._metrics_at = time.monotonic()
         metrics = self._learner.metrics()
         self._process.figures = {
             "steps": metrics.steps,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,21 +80,15 @@ def main(settings: LearnerSettings) -> bool:
 class LearnerLoop:
     """Take steps and joins from the queues, let the learner work, and publish its weights, flow and metrics."""
 
-    def __init__(
-        self,
-        process: Process,
-        learner: Learner,
-        settings: LearnerSettings,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._process, self._learner, self._settings, self._clock = process, learner, settings, clock
+    def __init__(self, process: Process, learner: Learner, settings: LearnerSettings) -> None:
+        self._process, self._learner, self._settings = process, learner, settings
         self._steps = Inbox()
         self._joins: deque[tuple[bytes, str, Future[bytes]]] = deque()
         self._wake = Event()
         self._last_flow = pb.Flow()  # without the header, which `put` fills in
         self._flow_at = -1e9
         self._flow_waits = False  # a flow that actors need waits for its time
-        self.output = LearnerOutput(process, learner, settings.out, clock)
+        self.output = LearnerOutput(process, learner, settings.out)
         bus, robot = process.bus, learner.robot.name
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
         self._weights.put(learner.weights())
@@ -125,8 +118,8 @@ class LearnerLoop:
                 self._wake.wait(FLOW_SPACING if self._flow_waits else IDLE)
             self._wake.clear()
             if self._learner.done and not self._learner.weights_due():
-                end = end or self._clock() + LINGER
-                if self._clock() > end:
+                end = end or time.monotonic() + LINGER
+                if time.monotonic() > end:
                     break
         self._finish()
 
@@ -169,7 +162,7 @@ class LearnerLoop:
 
     def _publish_flow(self) -> None:
         """Publish the flow if it is old, or if actors need it: each message costs every process some time."""
-        flow, last, age = self._learner.flow(), self._last_flow, self._clock() - self._flow_at
+        flow, last, age = self._learner.flow(), self._last_flow, time.monotonic() - self._flow_at
         if self._settings.learner.lockstep:
             due = flow != last
         else:
@@ -177,7 +170,7 @@ class LearnerLoop:
             due, self._flow_waits = changed and age >= FLOW_SPACING, changed and age < FLOW_SPACING
         if due or age > FLOW_PERIOD:
             self._last_flow.CopyFrom(flow)
-            self._flow_at = self._clock()
+            self._flow_at = time.monotonic()
             self._flow.put(flow)
 
     def _finish(self) -> None:

@@ -80,14 +80,14 @@ class NStepWindows:
 
     def _close(self, moves: deque[ActorStep] | list[ActorStep]) -> list[Transition]:
         first, last = moves[0], moves[-1]
+        if first.cut:
+            return self._cut(first)
         reward = cost = penalty = 0.0
         for move in reversed(moves):
             reward = move.reward + self.gamma * reward
             cost = move.collision + self.gamma * cost
             penalty = move.penalty + self.gamma * penalty
         discount = 0.0 if last.terminated or last.cut else self.gamma ** len(moves)
-        if first.cut:
-            return self._cut(first)
         end, corrected = (reward, discount, last.next_observation, cost), float(first.penalty > 0.0)
         if self.stored == "executed" or np.array_equal(first.action, first.proposed):
             return [Transition(first.observation, first.action, *end, penalty, corrected)]

@@ -78,10 +78,6 @@ class RealtimeGroundRobot(GroundRobot):
         self.closest = float(self.clearance(self.true[:2]))
         self.distance_driven = 0.0  # m
 
-    def drive(self, input: Array) -> None:
-        """Drive at an input (2,) from now on, clipped as by `set_input`."""
-        self.set_input(input)
-
     def advance(self) -> None:
         """Advance to the next sample, by `SAMPLE_TIME` seconds."""
         before = self._true_pose()

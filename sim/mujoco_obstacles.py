@@ -122,13 +122,3 @@ def _wall(wall: Obstacle, arena: Arena) -> Geom:
     low, high = arena.bounds[2] if arena.dim == 3 else (0.0, HEIGHT)
     x, y = (wall.position[i] - half * turn(wall.yaw) for i, turn in enumerate((math.cos, math.sin)))
     return mujoco.mjtGeom.mjGEOM_BOX, (half, 1.5 * room, 0.5 * (high - low)), (x, y, 0.5 * (low + high))
-
-
-def map_model(arena: Arena) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Compile the obstacles of an arena without a robot, to compare a lidar with MuJoCo's rays."""
-    spec = mujoco.MjSpec()
-    add_obstacles(spec, arena)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return model, data

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import socket
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from brakeline.actors.mavlink.telemetry import Array, GeoPosition
+from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.structured_text import parse_json
 from brakeline.sim.quadrotor import QUADROTOR
@@ -70,10 +70,11 @@ class MavlinkGroundTruth:
     collisions that count.
     """
 
-    clearance_of: Callable[[Array], float]  # clearance [m] of a position (3,); below 0 the body touches an obstacle
+    obstacles: Shapes
+    footprint: float  # m, the body's radius
     state: Array | None = None  # (9,), with an unknown acceleration of 0; None before the first message
     collisions: int = 0  # number of times that the vehicle began to touch an obstacle
-    clearance: float = math.inf  # m, the latest
+    clearance: float = math.inf  # m, the latest; below 0 the body touches an obstacle
     least: float = math.inf  # m, the smallest clearance so far
     worst: float = 0.0  # m, the largest horizontal distance so far from the estimate to the truth
     _start: tuple[GeoPosition, Array] | None = None
@@ -92,7 +93,7 @@ class MavlinkGroundTruth:
             position[2] = estimate[2]
         self.worst = max(self.worst, math.hypot(*(position - estimate)[:2]))
         self.state = np.concatenate((position, velocity, np.zeros(3)))
-        self.clearance = now = self.clearance_of(position)
+        self.clearance = now = float(self.obstacles.distance(position).min(initial=math.inf)) - self.footprint
         self.least = min(self.least, now)
         self.collisions += now < 0.0 and not self._touching
         self._touching = now < 0.0

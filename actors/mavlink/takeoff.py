@@ -150,10 +150,10 @@ class Takeoff:
                     f"{limit.parameter} is {value:g} ({limit.what}), and the filter may need {needed:g}: raise it "
                     "(--raise-limits), or the vehicle cannot follow the filter's plans"
                 )
-        name = TIMEOUTS[kind]
-        timeout = client.parameter(name, wait)
         if self._flight.lead:
             return
+        name = TIMEOUTS[kind]
+        timeout = client.parameter(name, wait)
         if timeout is None and kind in FIXED_TIMEOUT:
             self.note(f"it has no {name}: if setpoints stop, it flies on for {FIXED_TIMEOUT[kind]:g} s")
         elif timeout is not None and timeout > SHORTEST_TIMEOUT:

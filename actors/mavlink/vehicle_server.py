@@ -140,14 +140,14 @@ class VehicleServer:
         self._frames: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
         self._updating = threading.Lock()
         self._rejected = RejectedMessages()
-        footprint, shapes = self._robot.footprint, Shapes.of(request.obstacles, self._robot.position_dim)
+        shapes = Shapes.of(request.obstacles, self._robot.position_dim)
         self._vehicle = MavlinkVehicle(
             request.robot,
             request.flight,
             tap=lambda frame: self._frames.append(frame_message(frame)),
             rejected=self._rejected,
             stop=lambda: stop.is_set() or actor.poll(),
-            mavlink_truth=MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
+            mavlink_truth=MavlinkGroundTruth(shapes, self._robot.footprint),
         )
         threading.Thread(target=self._send_updates, name="updates", daemon=True).start()
 

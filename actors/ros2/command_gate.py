@@ -40,8 +40,7 @@ class GateStats:
     periods: int = 0
     kinds: Counter[str] = field(default_factory=Counter)  # periods by decision, or `no answer`, `late`, `blind`
     commands: int = 0  # about which the gate decided
-    compared: int = 0  # measured states with a prediction
-    outside: int = 0  # of those, states outside of the predicted set
+    outside: int = 0  # measured states outside of the predicted set
     slips: int = 0  # periods that began late by a period or more
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))  # s, command to period
     decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
@@ -135,7 +134,6 @@ class CommandGate:
         stats.periods += 1
         if outcome is not None and outcome.answer is not None and in_time:
             answer = outcome.answer
-            stats.compared += answer.compared
             stats.outside += answer.compared and not answer.contained
             stats.decide_ms.append(answer.time_ms)
             self.kind, self.reason = answer.kind, answer.reason

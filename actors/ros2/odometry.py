@@ -57,24 +57,19 @@ class OdometryHistory:
         self._limits, self._gap = limits, gap
         self.jump = ""
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
     @property
     def newest(self) -> float:
         """Time of the newest odometry [s]; -inf without any."""
         return self._rows[-1][TIME] if self._rows else -math.inf
 
-    def add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
-        """Add an odometry. Return False if it is dropped: a number is not finite, or it is not newer than the last one.
+    def add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> None:
+        """Add an odometry, unless a number is not finite, or it is not newer than the last one.
 
         An odometry that is older by more than `HISTORY`, or whose pose the robot can't have reached, begins a new
         history: its sender has restarted, or was set.
         """
-        if not all(map(math.isfinite, (speed, turn_rate))) or not self._admit(time, x, y, heading):
-            return False
-        self._append(time, x, y, heading, speed, turn_rate)
-        return True
+        if all(map(math.isfinite, (speed, turn_rate))) and self._admit(time, x, y, heading):
+            self._append(time, x, y, heading, speed, turn_rate)
 
     def add_pose(self, time: float, x: float, y: float, heading: float) -> None:
         """Add a pose without speeds, see `add`. The speeds come from the poses of the last `SPEED_WINDOW` seconds."""

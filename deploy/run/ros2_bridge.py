@@ -146,10 +146,10 @@ class Bridge:
         with self._received:
             command, self._command = self._command, None
         if command is not None:
-            robot.drive(command)
+            robot.set_input(command)
             self._command_time, self._stopped = self.now, False
         elif not self._stopped and self.now - self._command_time > self.settings.timeout:
-            robot.drive(np.zeros(2))
+            robot.set_input(np.zeros(2))
             self._stopped = True
             self.outcome.timeouts += 1
         robot.advance()

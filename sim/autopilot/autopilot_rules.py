@@ -37,7 +37,6 @@ class AutopilotRules:
     initial_mode: Mode
     parameters: tuple[Parameter, ...]
     bitwise_integers: bool  # integer parameters travel as the bits of a float
-    timeout_parameter: str  # the parameter with the timeout of setpoints [s]
     limits: Callable[[Parameters], FlightLimits]
     modes: dict[int, Mode]  # by custom mode
     highest_mode: int  # the highest mode (PX4: main mode) that exists, implemented here or not
@@ -209,7 +208,6 @@ PX4 = AutopilotRules(
     initial_mode=Mode.HOLD,
     parameters=PX4_PARAMETERS,
     bitwise_integers=True,
-    timeout_parameter="COM_OF_LOSS_T",
     limits=_px4_limits,
     modes={
         3 << 16: Mode.POSITION,
@@ -248,7 +246,6 @@ ARDUPILOT = AutopilotRules(
     initial_mode=Mode.MANUAL,
     parameters=ARDUPILOT_PARAMETERS,
     bitwise_integers=False,
-    timeout_parameter="GUID_TIMEOUT",
     limits=_ardupilot_limits,
     modes={0: Mode.MANUAL, 4: Mode.OFFBOARD, 5: Mode.HOLD, 9: Mode.LAND, 17: Mode.BRAKE},
     highest_mode=27,
@@ -276,4 +273,4 @@ ARDUPILOT = AutopilotRules(
 )
 
 RULES = {rules.name: rules for rules in (PX4, ARDUPILOT)}
-SETPOINT_TIMEOUT = {rules.name: rules.timeout_parameter for rules in RULES.values()}
+SETPOINT_TIMEOUT = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}  # the parameters with the timeouts [s]

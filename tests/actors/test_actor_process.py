@@ -18,6 +18,7 @@ from brakeline.actors.actor_process import STANDSTILL, STOP_PRACTICE, ActorRunne
 from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.learner_client import LearnerClient
+from brakeline.actors.proposers import RealTimePolicy
 from brakeline.deploy.vehicle_factory import environment, fleet_world
 from brakeline.errors import BadRequest, BusError, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
@@ -177,6 +178,22 @@ def test_a_restarted_learner_is_joined_even_if_its_weights_are_older(buses: tupl
     assert client.wait(11, 7, never)
     assert version(client) == 4
     assert (len(learner.joins), learner.joins[-1].index, learner.joins[-1].episode) == (2, 10, 7)
+
+
+def test_a_robot_in_real_time_goes_on_when_a_restarted_learner_refuses_it(
+    buses: tuple[Bus, Bus], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pause = threading.Event()
+    monkeypatch.setattr("brakeline.actors.proposers.time", SimpleNamespace(sleep=pause.wait))
+    learner, policy = ScriptedLearner(buses[0]), RealTimePolicy(buses[1], GROUND, "actor-0")
+    assert policy.join(0, 0, never) == 3
+    learner.layout, learner.version = "that of another version", 4
+    learner.publish_flow(20, incarnation=2)
+    until(lambda: policy.ready(11, 7, never) and "the learner refuses actor-0" in caplog.text)
+    assert all(policy.ready(12, 7, never) for _ in range(100)) and len(learner.joins) == 2, "it asks from time to time"
+    learner.layout = GROUND.learning_layout()
+    pause.set()
+    until(lambda: policy.ready(13, 7, never) and version(policy) == 4)
 
 
 def test_an_actor_without_permission_joins_again(buses: tuple[Bus, Bus], monkeypatch: pytest.MonkeyPatch) -> None:

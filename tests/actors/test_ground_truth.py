@@ -4,6 +4,7 @@ skipped."""
 from __future__ import annotations
 
 import json
+import math
 import socket
 from collections.abc import Iterator
 
@@ -13,6 +14,7 @@ import pytest
 from brakeline.actors.mavlink.ground_truth import MOST_DATAGRAMS, MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.telemetry import GeoPosition
 from brakeline.messaging.free_ports import free_udp_port
+from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
 
 METRES = 0.0111195  # of latitude, a ten millionth of a degree
@@ -23,8 +25,9 @@ def at(north: float, altitude: float | None = 10.0) -> GeoPosition:
 
 
 def test_a_collision_is_judged_by_the_truth_and_counted_once() -> None:
-    """A wall is 5 m north; the drifting estimate stays in front of it."""
-    truth = MavlinkGroundTruth(lambda position: 5.0 - position[1])
+    """A wall is 5 m north of the body of 1 m; the drifting estimate stays in front of it."""
+    wall = Obstacle("wall", (0.0, 6.0, 0.0), yaw=-0.5 * math.pi)
+    truth = MavlinkGroundTruth(Shapes.of([wall], 3), footprint=1.0)
     for north in (0.0, 3.0, 4.9, 5.2, 5.4, 4.0, 5.1):
         estimate = np.array([1.0, 0.5 * north, 3.0])
         truth.take(at(north), estimate, np.zeros(3))
@@ -35,10 +38,18 @@ def test_a_collision_is_judged_by_the_truth_and_counted_once() -> None:
 
 
 def test_without_an_altitude_the_height_is_the_estimates() -> None:
-    truth = MavlinkGroundTruth(lambda position: float(position[2]))
+    floor = Obstacle("box", (0.0, 0.0, -1.0), (9.0, 9.0, 2.0))
+    truth = MavlinkGroundTruth(Shapes.of([floor], 3), footprint=0.5)
     for height in (3.0, 2.0):
         truth.take(at(0.0, None), np.array([0.0, 0.0, height]), np.zeros(3))
-    assert truth.clearance == pytest.approx(2.0)
+    assert truth.clearance == pytest.approx(1.5)
+
+
+def test_a_flight_without_obstacles_is_judged_too() -> None:
+    truth = MavlinkGroundTruth(Shapes.of((), 3), footprint=0.5)
+    truth.take(at(0.0), np.zeros(3), np.zeros(3))
+    assert truth.collisions == 0 and truth.clearance == truth.least == math.inf
+    assert truth.state is not None
 
 
 STATE = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]

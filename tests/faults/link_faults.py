@@ -310,8 +310,7 @@ def judged(url: str, system: int) -> Iterator[Judge]:
     robot = robot_named("quadrotor-late")
     link = open_link(url)
     client = AutopilotClient(link.send, system)
-    judge = Judge(client, link, MavlinkGroundTruth(lambda at: float(MAP.shapes.distance(at).min()) - robot.footprint))
-
+    judge = Judge(client, link, MavlinkGroundTruth(MAP.shapes, robot.footprint))
     try:
         wait = sitl.connected(link, client)
         wait(lambda: False, 60.0)  # until its estimator is ready

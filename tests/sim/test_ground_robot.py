@@ -314,7 +314,7 @@ def test_a_robot_in_real_time_has_the_disturbances_of_one_in_lockstep() -> None:
     lockstep = GroundRobot(arena, np.random.default_rng(5))
     realtime = RealtimeGroundRobot(arena, np.random.default_rng(5))
     for input in (AHEAD, CURVE, STAND, STAND, STAND, CURVE):
-        realtime.drive(input)
+        realtime.set_input(input)
         for _ in range(lockstep.samples):
             realtime.advance()
         assert np.abs(lockstep.step(input).true - realtime.true).max() < 1e-9

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.environment_speed import map_model
 from brakeline.messaging.obstacle import CYLINDER, SPHERE, WALL, Obstacle, Shapes, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.task import RobotWithTask
@@ -11,7 +12,7 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.batch.obstacle_batch import ObstacleBatch
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles, map_model
+from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles
 from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 

@@ -23,7 +23,8 @@ from brakeline.logs.reader import Record, read
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.accepting import WORDS
 from tests.robots import QUADROTOR
-from tests.system.runs import Run, until
+from tests.system.runs import Run
+from tests.waiting import until
 
 pytestmark = pytest.mark.usefixtures("flight_folder")
 

@@ -103,7 +103,7 @@ def drive(ask: Ask, seed, periods, degrees, policy, arena="default", masked=(), 
     why, seen = "not begun", None
     for number in range(periods):
         began = 10.0 + number * ROBOT.period
-        robot.drive(gate.begin(began, True, why))
+        robot.set_input(gate.begin(began, True, why))
         outcome.kinds[gate.kind] += 1
         outcome.reasons[gate.reason.partition(":")[2][:60] if gate.kind == "blind" else gate.reason[:60]] += 1
         waits = waits + 1 if gate.kind == "blind" and number > 2 else 0

@@ -57,7 +57,7 @@ def transform(parent, child, x=0.0, y=0.0, rotation=None, at=0.0):
 def test_states_are_interpolated_and_extrapolated_a_little():
     history = OdometryHistory(LIMITS)
     for i in range(11):
-        assert history.add(0.1 * i, 0.02 * i, 0.0, 0.0, 0.2, 0.0)
+        history.add(0.1 * i, 0.02 * i, 0.0, 0.0, 0.2, 0.0)
     assert history.state(0.55) == pytest.approx([0.11, 0.0, 0.0, 0.2, 0.0])
     assert history.state(1.05) == pytest.approx([0.21, 0.0, 0.0, 0.2, 0.0])
     assert history.state(1.2) is None and history.state(-0.1) is None
@@ -75,9 +75,12 @@ def test_the_history_is_bounded_and_restarts_when_time_goes_back():
     history = OdometryHistory(LIMITS)
     for i in range(1000):
         history.add(0.01 * i, 0.0, 0.0, 0.0, 0.0, 0.0)
-    assert len(history) <= HISTORY / 0.01 + 2
-    assert not history.add(9.5, 0.0, 0.0, 0.0, 0.0, 0.0) and not history.add(math.nan, 0, 0, 0, 0, 0)
-    assert history.add(1.0, 0.0, 0.0, 0.0, 0.0, 0.0) and len(history) == 1
+    assert len(history._rows) <= HISTORY / 0.01 + 2
+    for at, x in ((9.5, 1.0), (math.nan, 1.0), (10.0, math.nan)):
+        history.add(at, x, 0.0, 0.0, 0.0, 0.0)
+    assert history.newest == pytest.approx(9.99) and history.state(9.5)[0] == 0.0
+    history.add(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert history.newest == 1.0 and history.state(1.0) is not None and history.state(9.5) is None
 
 
 def test_speeds_are_computed_from_poses_without_speeds():
@@ -98,7 +101,7 @@ def test_no_state_is_interpolated_in_a_long_gap():
     for at in (0.0, 0.05, 0.1, 0.15, 1.15, 1.2, 1.25, 1.3):
         poses.add_pose(at, 0.2 * at, 0.0, 0.0)
     assert poses.state(0.05) is None, "one pose gives no speed"
-    assert poses.state(0.12)[3] == pytest.approx(0.2) if poses.state(0.12) is not None else True
+    assert poses.state(0.12)[3] == pytest.approx(0.2)
     assert poses.state(1.17) is None and poses.state(1.28)[3] == pytest.approx(0.2)
 
 
@@ -186,9 +189,10 @@ def test_what_a_robot_can_do_is_no_jump():
     """Neither are a gap, a late stamp, and errors of the measurement."""
     history = OdometryHistory(LIMITS)
     for time, x, heading in ((0.0, 0.0, 3.1), (0.02, 0.02, -3.12), (0.021, 0.005, 3.1), (4.0, 1.5, 0.5)):
-        assert history.add(time, x, 0.0, heading, 0.2, 0.0) and history.jump == ""
-    assert history.add(1.0, 1.5, 0.0, 0.5, 0.2, 0.0)
-    assert history.jump == "the time of the odometry went back by 3.00 s"
+        history.add(time, x, 0.0, heading, 0.2, 0.0)
+        assert history.newest == time and history.jump == ""
+    history.add(1.0, 1.5, 0.0, 0.5, 0.2, 0.0)
+    assert history.newest == 1.0 and history.jump == "the time of the odometry went back by 3.00 s"
 
 
 def test_odometry_in_another_frame_is_refused_and_both_are_named():
