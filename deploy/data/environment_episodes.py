@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -19,6 +19,7 @@ from brakeline.deploy.data.excitation import MOST_HELD, excitation
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.progress import Advance, under_way
 from brakeline.errors import BadData
+from brakeline.messaging.acceleration_age import ENTRY, about_age
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
@@ -69,7 +70,8 @@ def collect(
 
     Raises:
         Mismatch: the environment gives no state, or its action space does not match the robot's inputs.
-        BadData: the recording is not a valid data set, or every episode ends at once.
+        BadData: the recording is not a valid data set, or every episode ends at once, or `acceleration_age` in `info`
+            differs between episodes.
     """
     driven = _Environment(env, robot, mapping_for_space(env.action_space, robot, actions), state, disturbed)
     with under_way(f"driving {robot.name}", periods) if shown else nullcontext(_ignore) as advance:
@@ -77,6 +79,7 @@ def collect(
     if chord_deviation is None:
         chord_deviation = _chord_deviation(robot, trajectories)
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
+    about |= about_age(driven.ages)
     data = Dataset(robot, without_repeats(robot, trajectories)[0], about, chord_deviation)
     data.check()
     return data
@@ -132,12 +135,14 @@ class _Environment:
     mapping: ActionMapping
     view: View
     disturbed: Callable[[Any, Any, dict[str, Any]], bool]
+    ages: set[float] = field(default_factory=set)  # `acceleration_age` in `info` of the episodes [s]
 
     def episode(
         self, inputs: Generator[Array, Array | None, None], most: int, seed: int | None, options: dict[str, Any] | None
     ) -> Iterator[Trajectory]:
         """Yield the undisturbed trajectories of one episode of at most `most` periods."""
         observation, info = self.env.reset(seed=seed, options=options)
+        self.ages.add(float(info.get(ENTRY, 0.0)))
         u, built = next(inputs), TrajectoryBuilder(self._state(observation, info))
         for _ in range(most):
             action = action_for(u, self.mapping, self.env.action_space)

@@ -201,6 +201,7 @@ class RecordedClient:
             action=action.tolist(),
             decision=pb.FAILSAFE,
             fallback=answer is None,
+            acceleration_age=self.backup_plan.acceleration_age,
         )
         if answer is not None:
             set_decision(step, answer)

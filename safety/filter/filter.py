@@ -210,7 +210,7 @@ class Filter:
             record.reason = "the state is outside the domain that was recorded"
         if candidate is None:
             candidate = self._committed(request, local_map, z_0, record, in_domain)
-            if in_domain and not blind and request.reservation is None:  # other robots rely on the reservation
+            if in_domain and not blind:
                 candidate = RecoverySearch(self, request, local_map, z_0).candidate() or candidate
             if isinstance(request.scan, RangeImage) and (lacking := unseen_poles(request.scan)):
                 record.reason += f"; {lacking}"
@@ -330,7 +330,7 @@ class Filter:
         centers, half = constraints.sets(local_map.start, local_map.turn, z)
         reservation = request.reservation
         if reservation is not None and not candidate.continues:
-            reservation = self._reserve(constraints, local_map.start, centers, half, z)
+            reservation = self.reserve(constraints, local_map.start, local_map.turn, z)
         predicted = constraints.predict(local_map, z)
         margin, at_least = constraints.clear(request, local_map, z, candidate.margin)
         scores = self.scores(request) or (None, None)
@@ -379,12 +379,11 @@ class Filter:
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
         start, constraints = state[: self.robot.position_dim], self.constraints_for(z, widening)
-        return self._reserve(constraints, start, *constraints.sets(start, constraints.turn(heading), z), z)
+        return self.reserve(constraints, start, constraints.turn(heading), z)
 
-    def _reserve(
-        self, constraints: TubeConstraints, start: Array, centers: Array, half: Array, z: Array
-    ) -> Reservation:
-        """Return the reservation of a tube with centers and half-widths (N, d), world, and regressors z."""
+    def reserve(self, constraints: TubeConstraints, start: Array, turn: Array, z: Array) -> Reservation:
+        """Return the reservation of the plan with regressors z from a start (d,); turn (d, d): robot to world."""
+        centers, half = constraints.sets(start, turn, z)
         lengths = constraints.widening * constraints.tube.magnitudes(z)[constraints.tube.generators :]
         *chord_deviations, stopping_distance = lengths
         chord_deviations[-1] = max(chord_deviations[-1], stopping_distance)

@@ -31,12 +31,15 @@ class RecoverySearch:
         safety: the filter. local_map: the surroundings. z_0 (known,): regressors that are known.
         before (m,): the input in force.
         moves: the robot is on a way out already.
+        touched (n,): which reservations of other robots the robot's own one touches.
     """
 
     def __init__(self, safety: Filter, request: Request, local_map: LocalMap, z_0: Array) -> None:
         self.safety, self.request, self.local_map, self.z_0 = safety, request, local_map, z_0
         self.before = z_0[-safety.robot.action_dim :]
         self.moves = is_on_a_way_out(safety.robot, request)
+        own, others = request.reservation, request.other_reservations
+        self.touched = np.zeros(0, dtype=bool) if own is None or others is None else others.touched(own)
 
     def candidate(self) -> PlanCandidate | None:
         """Return the plan of the way out; None if the robot needs none, or if there is none."""
@@ -62,7 +65,7 @@ class RecoverySearch:
         """Return whether a robot that stands, or is on a way out, violates more by standing than it may seem to.
 
         It may seem to violate what two measurement errors explain. Where it stays as it stands, the clearance margin
-        comes on top.
+        comes on top. A robot whose reservation touches another's has no verified plan, however little they touch.
         """
         safety, request, local_map = self.safety, self.request, self.local_map
         if not (request.still(safety.robot) or self.moves):
@@ -70,7 +73,7 @@ class RecoverySearch:
         if isinstance(request.scan, Scan) and not shows_free(request.scan, local_map.start):
             return False
         seeming = 0.0
-        if not self.moves:
+        if not (self.moves or self.touched.any()):
             seeming = 2.0 * safety.constraints.measurement_error
             seeming += safety.clearance_margin if safety.constraints.stays else 0.0
         constraints = safety.constraints_for(stand, local_map.widening)
@@ -97,7 +100,9 @@ class RecoverySearch:
         slow = [inputs.limited(np.clip(u, -most, most), self.before) for u in slow_inputs(robot)]
         plans = [inputs.regressors(self.z_0, action) for action in slow]
         violated = standing + (np.array(plans) - stand) @ rows.gradient.T
-        best = least_violating(violated, standing, ends_of_plan(robot, planes, len(rows.bound)))
+        violated[[self._comes_upon_another(z) for z in plans]] = np.inf
+        others = 0 if (near := self.local_map.other_reservations) is None else len(near)
+        best = least_violating(violated, standing, ends_of_plan(robot, planes, len(rows.bound), others))
         return None if best is None else plans[best]
 
     def _turn(self, rows: ConstraintRows, planes: list[Planes], stand: Array, standing: Array) -> Array | None:
@@ -105,7 +110,10 @@ class RecoverySearch:
 
         A turn moves only the discs beside the measured position.
         """
-        safety, away = self.safety, self.local_map.away
+        safety, away, others = self.safety, self.local_map.away, self.request.other_reservations
+        if others is not None and self.touched.any():
+            ways = -others.take(self.touched).shapes.towards(self.local_map.start)
+            away = ways[np.argmin(np.einsum("nd,nd->n", ways, ways))]
         if safety.robot.heading is None or away is None:
             return None
         turn = turn_towards(safety.robot, self.local_map.heading, away)
@@ -113,7 +121,16 @@ class RecoverySearch:
         rows_of_disc = [rows_per_obstacle(safety.robot.horizon) * len(disc.normals) for disc in planes]
         swung = np.flatnonzero(np.repeat([disc.aside for disc in safety.constraints.discs], rows_of_disc))
         turned = standing[swung] + rows.gradient[swung] @ (z - stand)
-        return z if harmless(turned[None], standing[swung])[0] else None
+        return z if harmless(turned[None], standing[swung])[0] and not self._comes_upon_another(z) else None
+
+    def _comes_upon_another(self, z: Array) -> bool:
+        """Return whether the reservation of a plan touches one that the robot's own one does not touch."""
+        if (others := self.request.other_reservations) is None:
+            return False
+        local_map = self.local_map
+        own = self.safety.constraints.at(z, local_map.widening)
+        plan = self.safety.reserve(own, local_map.start, local_map.turn, z)
+        return bool((others.touched(plan) & ~self.touched).any())
 
 
 def is_on_a_way_out(robot: Robot, request: Request) -> bool:
@@ -123,11 +140,16 @@ def is_on_a_way_out(robot: Robot, request: Request) -> bool:
     return request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
 
 
-def ends_of_plan(robot: Robot, planes: list[Planes], count: int) -> NDArray[np.bool_]:
-    """Return which of `count` rows are of the end of the plan: for each obstacle the row after the stop."""
-    rows_each = rows_per_obstacle(robot.horizon)
-    ends = np.zeros(count, dtype=bool)
-    ends[rows_each - 1 : rows_each * sum(len(disc.normals) for disc in planes) : rows_each] = True
+def ends_of_plan(robot: Robot, planes: list[Planes], count: int, others: int = 0) -> NDArray[np.bool_]:
+    """Return which of `count` rows are of the end of the plan: for each obstacle the row after the stop.
+
+    others: number of reservations of other robots. Of each, it is the row of the last set.
+    """
+    rows_each, (N, d) = rows_per_obstacle(robot.horizon), (robot.horizon, robot.position_dim)
+    ends, of_obstacles = np.zeros(count, dtype=bool), rows_each * sum(len(disc.normals) for disc in planes)
+    ends[rows_each - 1 : of_obstacles : rows_each] = True
+    rows_each = (N + 1) << d  # of a reservation
+    ends[of_obstacles + rows_each - 1 : of_obstacles + rows_each * others : rows_each] = True
     if not robot.position_dim:
         ends[robot.horizon * len(robot.limits) : (robot.horizon + 1) * len(robot.limits)] = True
     return ends

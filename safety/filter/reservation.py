@@ -80,9 +80,14 @@ class OtherReservations(ComparedByValue):
 
     def touch(self, own: Reservation) -> bool:
         """Return whether a robot's own reservation touches one of them in the same period."""
+        return bool(self.touched(own).any())
+
+    def touched(self, own: Reservation) -> NDArray[np.bool_]:
+        """Return which of them (n,) a robot's own reservation touches in the same period."""
         center, half, radius = (np.tile(part.T, len(self)).T for part in (own.center, own.half_width, own.radius))
         between = np.maximum(np.abs(self.shapes.center - center) - self.shapes.half - half, 0.0)
-        return bool((np.linalg.norm(between, axis=1) - self.shapes.margin - radius < -ROUNDED).any())
+        overlaps = np.linalg.norm(between, axis=1) - self.shapes.margin - radius < -ROUNDED
+        return np.asarray(overlaps.reshape(-1, self.periods).any(axis=1))
 
     def take(self, chosen: NDArray[np.bool_]) -> OtherReservations:
         """Return the chosen (n,) reservations."""

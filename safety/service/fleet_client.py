@@ -26,6 +26,7 @@ from brakeline.safety.service.client import (
     request_message,
 )
 from brakeline.safety.service.filter_client import Answer, accept
+from brakeline.safety.service.wire import MAX_REQUESTS
 
 
 class FleetClient(BusClient):
@@ -51,11 +52,13 @@ class FleetClient(BusClient):
         """Make a client for robots of one kind; names: of the robots. acceleration_age: see `SafetyClient`.
 
         Raises:
-            ValueError: there are fewer than two names, or two are equal, or the robot has no position; or the deadline
-                is not above 0 and at most a day.
+            ValueError: there are fewer than two names, or more than a service decides on at once, or two are equal, or
+                the robot has no position; or the deadline is not above 0 and at most a day.
         """
-        if len(names) < 2 or len(set(names)) < len(names):
-            raise ValueError(f"a fleet needs two robots or more with different names, not {list(names)}")
+        if isinstance(names, str) or len(names) < 2 or len(set(names)) < len(names):
+            raise ValueError(f"a fleet needs two robots or more with different names, not {names!r:.80}")
+        if len(names) > MAX_REQUESTS:
+            raise ValueError(f"a fleet has at most {MAX_REQUESTS} robots, not {len(names)}: a service refuses more")
         super().__init__(bus, robot, deadline)
         if not self.robot.position_dim:
             raise ValueError(f"{self.robot.name} has no position, so it reserves no space: use a SafetyClient for each")

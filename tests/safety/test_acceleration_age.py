@@ -1,13 +1,17 @@
 """A model set decides only about states whose horizontal acceleration has the age of its recorded data."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 
+from brakeline.deploy.data.environment_episodes import collect
+from brakeline.deploy.run.recorded_client import RecordedClient
 from brakeline.errors import BadData, BadModel, BadRequest, Mismatch, SafetyError
+from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.acceleration_age import ENTRY, about_age, acceleration_age_in
 from brakeline.messaging.topics import DECIDE
@@ -122,6 +126,19 @@ def test_a_wrapper_asks_with_the_age_that_the_environment_states(aged: Filter, w
         env.reset(seed=0)
         assert np.all(env.step(np.zeros(env.action_space.shape))[4]["diagnostics"]["kind"] == ALLOWED)
     one(InProcess(aged, 1.0, acceleration_age=0.2), Silent).reset(seed=0)
+
+
+def test_data_of_an_environment_say_the_age_that_it_states() -> None:
+    data = collect(Stating("ground"), GROUND, periods=30, shown=False)
+    assert acceleration_age_in(data.about) == 0.2
+
+
+def test_a_log_of_an_own_program_says_the_age(aged: Filter, tmp_path: Path) -> None:
+    with RecordedClient(InProcess(aged, accept_bound=1.0, acceleration_age=0.2), tmp_path / "mine") as client:
+        for _ in range(3):
+            client.decide(STILL, (0.0, 0.0), known_free=True)
+    steps = [record.message for record in open_log(client.path) if record.topic == "step"]
+    assert {step.acceleration_age for step in steps} == {0.2}
 
 
 def test_environments_of_different_ages_are_refused(aged: Filter) -> None:

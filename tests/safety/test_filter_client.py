@@ -309,9 +309,11 @@ def test_a_fleet_needs_an_entry_for_each_robot_and_the_error_names_what_lacks_on
 
 
 def test_a_malformed_fleet_is_refused(fleet):
-    for names in ((), ("alone",), ("same", "same")):
+    for names in ((), ("alone",), ("same", "same"), "left"):
         with pytest.raises(ValueError, match="two robots or more"):
             FleetClient(fleet.bus, "ground", names)
+    with pytest.raises(ValueError, match="at most 64 robots, not 65: a service refuses more"):
+        FleetClient(fleet.bus, "ground", [f"robot-{i}" for i in range(65)])
 
 
 def test_a_name_or_a_model_set_is_no_filter_and_the_error_says_what_to_give() -> None:

@@ -19,6 +19,7 @@ from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, correction_penalties
 from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from brakeline.safety.filter.widening import WINDOWS, Widening
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.service.in_process import InProcess
@@ -121,6 +122,9 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
     single.backup_plan.measured(states[0])
     assert np.allclose(outcome.inputs[0], single.backup_plan.fallback())
     assert outcome.decided.tolist() == [False, broken is not FAILING] and outcome.failure
+    if outcome.answers is not None:
+        assert outcome.answers.verified.tolist() == [False, True]
+        assert [outcome.answers.row(row).kind for row in range(2)] == [FAILSAFE, ALLOWED]
     assert np.allclose(outcome.inputs[1], actions[1]) == (broken is not FAILING)
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
 

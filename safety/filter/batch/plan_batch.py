@@ -8,7 +8,7 @@ plans.reset(ended)                                       # the robots whose epis
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +18,10 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
-from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+from brakeline.safety.filter.batch.decision_arrays import KINDS, DecisionArrays
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionArrays, RequestArrays
+from brakeline.safety.filter.request import FAILSAFE
 from brakeline.safety.filter.widening import WINDOWS, widening_factor
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ class BatchOutcome:
 
     inputs: Array  # (B, m): to execute in the coming period
     decided: Flags  # (B,): whether the row has a decision; without one, the robot follows its committed plan
-    answers: DecisionArrays | None  # the decisions; None: the whole batch has none
+    # the decisions; None: the whole batch has none. A row without one has the kind failsafe, and is not verified.
+    answers: DecisionArrays | None
     failure: str = ""  # why a row has no decision. Empty if all rows have one.
 
 
@@ -148,8 +150,14 @@ class BackupPlanBatch:
             nothing = np.zeros(self._size, dtype=bool)
             return BatchOutcome(self._follow(states, nothing, None), nothing, None, failure)
         decided = usable & self._is_possible(answers)
-        failure = "" if decided.all() else NO_DECISION
-        return BatchOutcome(self._follow(states, decided, answers), decided, answers, failure)
+        if decided.all():
+            return BatchOutcome(self._follow(states, decided, answers), decided, answers)
+        inputs = self._follow(states, decided, answers)
+        # The other rows hold the answers to values that nobody asked about, or plans that are not possible.
+        singly = {row: one for row, one in answers.singly.items() if decided[row]}
+        kind, verified = np.where(decided, answers.kind, KINDS.index(FAILSAFE)), answers.verified & decided
+        answers = replace(answers, kind=kind, verified=verified, singly=singly)
+        return BatchOutcome(inputs, decided, answers, NO_DECISION)
 
     def contains(self, states: Array) -> Flags:
         """Return whether measured states (B, n) lie in the predicted sets: `Prediction.contains` for each row."""

@@ -1,0 +1,91 @@
+"""Robots of a fleet that stand with reservations that touch creep apart, and no other robot loses its plan."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+
+from brakeline.messaging.robot import Array
+from brakeline.safety.filter.backup_plan import BackupPlan
+from brakeline.safety.filter.request import FAILSAFE, RECOVERING
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.client import read_reply, request_message
+from brakeline.safety.service.filter_client import Answer, accept
+from tests.robots import GROUND
+from tests.safety.asked import apart
+from tests.safety.served import Service
+from tests.safety.unicycle import Unicycle
+
+PUSHED = 15
+Period = tuple[list[Answer], list[BackupPlan], Array]
+
+
+def drive(model: ModelSet, poses: Sequence[Sequence[float]], push: float, periods: int) -> Iterator[Period]:
+    """Let the first two robots drive straight ahead, and push the first one forward by `push` [m] before period PUSHED.
+
+    Yield the answers, the backup plans and the true positions after each period. The other robots want to stand.
+    """
+    rng, service = np.random.default_rng(0), Service(model)
+    robots, plans = [Unicycle(pose, rng) for pose in poses], [BackupPlan(GROUND) for _ in poses]
+    names = [f"robot-{i}" for i in range(len(poses))]
+    actions = [[0.25, 0.0]] * 2 + [[0.0, 0.0]] * (len(poses) - 2)
+    for step in range(periods):
+        robots[0].state[0] += push * (step == PUSHED)
+        messages = [
+            request_message(plan, robot.measure(), action, known_free=True, actor=name, step=step, fleet=names)
+            for robot, plan, name, action in zip(robots, plans, names, actions, strict=True)
+        ]
+        replies = zip(service.replies(*messages), messages, strict=True)
+        answers = [read_reply(reply, message, GROUND) for reply, message in replies]
+        for robot, plan, answer in zip(robots, plans, answers, strict=True):
+            accept(plan, answer)
+            robot.step(answer.action)
+        yield answers, plans, np.array([robot.state[:2] for robot in robots])
+
+
+@pytest.mark.parametrize("towards", [0.02, 0.03])
+def test_robots_that_were_pushed_together_creep_apart_and_drive_on(model: ModelSet, towards: float) -> None:
+    """Without that, they would stand for ever: every plan of either begins in the other's reservation."""
+    facing = [(-0.3, 0.0, 0.0), (0.3, 0.0, np.pi)]
+    kinds, gaps, verified = [], [], []
+    for answers, _, at in drive(model, facing, towards, 80):
+        kinds.append([answer.kind for answer in answers])
+        verified.append(all(answer.verified for answer in answers))
+        gaps.append(float(np.linalg.norm(at[0] - at[1])) - 2.0 * GROUND.footprint)
+        assert not (RECOVERING in kinds[-1] and verified[-1])
+    assert not verified[PUSHED] and any(RECOVERING in row for row in kinds[PUSHED + 1 :])
+    assert not any(RECOVERING in row for row in kinds[:PUSHED]), "without a violation they need no recovery"
+    assert min(gaps[PUSHED:]) > gaps[PUSHED] - 0.001, "they come no nearer"
+    assert verified[-1] and gaps[-1] > 0.1
+
+
+def test_a_way_out_takes_no_other_robots_space(model: ModelSet) -> None:
+    """The third robot stands behind the one that was pushed, where that one wants to go."""
+    kinds, final = [], False
+    for answers, plans, _ in drive(model, [(-0.2, 0.0, 0.0), (0.12, 0.0, np.pi), (-0.46, 0.0, 0.0)], 0.03, 80):
+        kinds.append([answer.kind for answer in answers])
+        assert answers[2].verified
+        final = all(answer.verified for answer in answers)
+        one, two, third = (plan.reservation for plan in plans)
+        assert one is not None and two is not None and third is not None
+        assert min(apart(one, third), apart(two, third)) > 0.0
+    assert any(row[0] == RECOVERING for row in kinds) and any(row[1] == RECOVERING for row in kinds) and final
+
+
+def test_a_robot_whose_reservation_touches_nothing_keeps_it_although_its_sets_are_wider_now(model: ModelSet) -> None:
+    """Its new reservation would touch the other robot's, which would then have no verified plan any more."""
+    near, names = 2.0 * GROUND.footprint + 0.05, ["left", "right"]
+    service, plans = Service(model), [BackupPlan(GROUND) for _ in names]
+    states = [np.zeros(5), np.array([near, 0.0, np.pi, 0.0, 0.0])]
+    for step, factor in enumerate((1.0, 8.0, 8.0)):
+        plans[0].widening.factors = factor, factor
+        messages = [
+            request_message(plan, state, [0.25, 0.0], known_free=True, actor=name, step=step, fleet=names)
+            for plan, state, name in zip(plans, states, names, strict=True)
+        ]
+        for plan, reply, message in zip(plans, service.replies(*messages), messages, strict=True):
+            answer = read_reply(reply, message, GROUND)
+            assert answer.verified
+            if plan is plans[0] and step:
+                assert answer.kind == FAILSAFE
+            accept(plan, answer)
