@@ -325,6 +325,17 @@ def test_the_last_steps_of_a_log(tmp_path):
         from_log(written(tmp_path / "none.mcap", ()), GROUND, last=60)
 
 
+def test_options_that_a_log_of_a_run_ignores_are_refused(tmp_path, capsys):
+    made = [(f"step/ground/{step.actor}", step, i) for i, step in enumerate(steps("a", 0, range(50)))]
+    log, out = str(written(tmp_path / "run.mcap", made)), str(tmp_path / "data.safetensors")
+    words = ["import", log, "--robot", "ground", "--out", out]
+    for ignored in ("--delay", "0.1"), ("--hold", "2"), ("--unit", "heading=deg"), ("--map", "speed=v"):
+        assert main([*words, *ignored]) == 1
+        assert f"{ignored[0]} would do nothing: leave that out" in " ".join(capsys.readouterr().err.split())
+    main(words)
+    assert "would do nothing" not in capsys.readouterr().err
+
+
 def test_steps_of_another_description_are_refused(tmp_path):
     """A step of 0.2 s is none of 0.1 s, and a state in another order is another state. A plan may be longer."""
     made = [(f"step/ground/{step.actor}", step, i) for i, step in enumerate(steps("a", 0, range(50)))]
