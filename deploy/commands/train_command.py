@@ -93,6 +93,11 @@ class TrainCommand(RunConfig):
             self._check_resumed(resumed)
             from_logs = self.from_logs or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
+        if self.penalty is not None and not self.actors:
+            raise ValueError(
+                "--penalty is for robots that drive, but --actors is 0: each step of a log has the penalty of its own "
+                "run. Leave out --penalty; --learner.td3.penalty-growth multiplies the penalties of the logs too"
+            )
         return self._config_of_options()
 
     def _check_resumed(self, resumed: RunConfig) -> None:

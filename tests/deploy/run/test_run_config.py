@@ -124,6 +124,12 @@ def test_the_options_start_from_the_experiment(tmp_path: Path) -> None:
         TrainCommand.defaults(["--experiment", "debag"])
 
 
+def test_a_penalty_without_robots_is_refused() -> None:
+    with pytest.raises(ValueError, match="--penalty is for robots that drive"):
+        parse("train", ["--from-logs", "runs/a", "--actors", "0", "--penalty", "5"]).config()
+    assert parse("train", ["--from-logs", "runs/a", "--actors", "1", "--penalty", "5"]).config().penalty == 5.0
+
+
 def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(encode(CHANGED))
     resume = replace(TrainCommand.defaults(["ground"]), resume=tmp_path)
