@@ -7,6 +7,7 @@ env = SafetyWrapper(env, Filter(model), state=state, obstacles=obstacles, action
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -71,6 +72,8 @@ def collect(
         Mismatch: the environment gives no state, or its action space does not match the robot's inputs.
         BadData: the recording is not a valid data set, or every episode ends at once.
     """
+    if chord_deviation is not None and not 0.0 <= chord_deviation < math.inf:
+        raise BadData(f"the chord deviation {chord_deviation} is no length in m")
     driven = _Environment(env, robot, mapping_for_space(env.action_space, robot, actions), state, disturbed)
     with under_way(f"driving {robot.name}", periods) if shown else nullcontext(_ignore) as advance:
         trajectories = _drive(driven, robot, periods, held, seed, options, advance)
