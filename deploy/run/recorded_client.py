@@ -162,9 +162,11 @@ class RecordedClient:
 
         A reward that is not finite, or 1e9 and more, counts as zero, because a log with it has no sums.
         """
+        reward = reward if abs(reward) < MAX_VALUE else 0.0
         if self._pending is not None:
-            self._pending.reward = reward if abs(reward) < MAX_VALUE else 0.0
-            self._pending.goal, self._pending.collision = goal, collision
+            self._pending.reward, self._pending.goal, self._pending.collision = reward, goal, collision
+        elif self._latest is not None:  # `decide` failed, and the program stops the robot without `fallback`
+            _add_outcome(self._unmeasured, pb.Step(reward=reward, goal=goal, collision=collision))
 
     def reset(self, *, goal: bool = False, collision: bool = False) -> None:
         """End the episode and begin the next one with a robot that stands still. The arguments say how it ended."""

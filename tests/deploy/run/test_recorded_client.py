@@ -128,9 +128,14 @@ def test_the_outcome_of_a_period_without_a_measured_end_is_not_lost(method, tmp_
         drive(safety, 2)
         safety.record_outcome(1.0, goal=True)
         safety.fallback()
+        safety.reset()
+        drive(safety, 2)
+        with pytest.raises(BadRequest):
+            safety.decide([0.0] * 5, [0.2, 0.0])  # and no `fallback`: the program stops by itself
+        safety.record_outcome(-1.0, collision=True)
     counted = figures("analyse", safety.path)
-    assert (counted["episodes"], counted["collisions"], counted["goals"]) == (5, 4, 1)
-    assert counted["mean_reward"] == (-1.5 - 1.0 - 1.5 - 1.0 + 1.0) / 5
+    assert (counted["episodes"], counted["collisions"], counted["goals"]) == (6, 5, 1)
+    assert counted["mean_reward"] == (-1.5 - 1.0 - 1.5 - 1.0 + 1.0 - 1.0) / 6
     assert all(len(step.state) == 5 for step in messages(safety.path, "step"))
 
 
