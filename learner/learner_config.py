@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -80,8 +80,8 @@ class TD3Config:
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
             raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
 
-    def with_settings(self, settings: Mapping[str, Any]) -> TD3Config:
-        """Return these settings, with `settings` in place of those that have their default value.
+    def with_settings(self, settings: Mapping[str, Any], given: Collection[str] = ()) -> TD3Config:
+        """Return these settings, with `settings` in place of those that have their default value and are not `given`.
 
         >>> TD3Config(tau=0.01).with_settings({"tau": 0.02, "imitation": 1.0}).tau
         0.01
@@ -94,7 +94,7 @@ class TD3Config:
             raise ValueError(f"TD3 has no setting {', '.join(sorted(unknown))}")
         own: dict[str, Any] = {}
         for name, value in settings.items():
-            if getattr(self, name) == getattr(default, name):
+            if name not in given and getattr(self, name) == getattr(default, name):
                 own[name] = tuple(value) if isinstance(value, list) else value
         try:
             return replace(self, **own)

@@ -304,10 +304,10 @@ def without_copies(paths: Sequence[Path]) -> tuple[Path, ...]:
     runs = {run: tuple(files) for run, files in groupby(paths, key=_run_of)}
     folders = Counter(folder for folder, _ in runs)
     several = {run: files for run, files in runs.items() if folders[run[0]] > 1}
-    firsts = {run: {first_message(path) for path in files} for run, files in several.items()}
+    firsts = {run: {first_message(path) for path in files} - {None} for run, files in several.items()}
     copies: set[Path] = set()
     for one, other in combinations(several, 2):
-        same = one[0] == other[0] and None not in firsts[one] | firsts[other]
+        same = one[0] == other[0] and firsts[one] and firsts[other]
         if same and (firsts[one] <= firsts[other] or firsts[other] <= firsts[one]):
             kept, left_out = sorted((several[one], several[other]), key=_most_and_oldest)
             if copies.isdisjoint((*kept, *left_out)):

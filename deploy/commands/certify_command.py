@@ -197,6 +197,11 @@ class CertifyCommand:
             path, data = self.data, Dataset.load(self.data)
             if robot.kind == data.robot.kind:
                 data = described_today(data, robot, path)
+            elif self.robot != CertifyCommand.robot:  # which nobody may have given
+                raise ValueError(
+                    f"{path} has data of {data.robot.kind}, not of {robot.kind}: certify {data.robot.kind}, or import "
+                    f"the log again with --robot {self.robot}"
+                )
         else:
             return self.data, *from_log(self.data, robot, self.last)
         return path, data, f"{data.periods} recorded periods of {data.robot.name}"

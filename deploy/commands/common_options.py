@@ -310,6 +310,16 @@ def task_learner(learner: LearnerConfig, arguments: list[str], batch: bool = Fal
         raise ValueError(f"[learner] or [batch] of the robot's task: {error}") from error
 
 
+def given_settings(arguments: list[str], prefix: str) -> tuple[str, ...]:
+    """Return the names of the settings that options such as --td3.n-step give, also with their default values.
+
+    >>> given_settings(["ground", "--td3.n-step", "3", "--td3.no-symmetric", "--steps=9"], "--td3.")
+    ('n_step', 'symmetric')
+    """
+    words = (word.partition("=")[0] for word in arguments if word.startswith(prefix))
+    return tuple(word.removeprefix(prefix).removeprefix("no-").replace("-", "_") for word in words)
+
+
 def default_keys() -> Path | None:
     """Return the folder in `$BRAKELINE_KEYS`, or None if the variable is not set."""
     folder = os.environ.get("BRAKELINE_KEYS")

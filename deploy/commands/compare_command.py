@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import tyro
 from rich.markdown import Markdown
 
 from brakeline.deploy.commands.command_output import console, print_json
-from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
-from brakeline.deploy.experiments.compared_methods import SAC_LEARNER, compared
+from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed, given_settings
+from brakeline.deploy.experiments.compared_methods import SAC_LEARNER, SAC_SETTINGS, compared
 from brakeline.deploy.experiments.comparison_cells import (
     RESULTS,
     RUNS,
@@ -27,7 +27,7 @@ from brakeline.deploy.experiments.comparison_cells import (
 from brakeline.deploy.experiments.experiment_jobs import Job, complete, read, task_hash
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
-from brakeline.deploy.run.run_config import SEEDS
+from brakeline.deploy.run.run_config import SEEDS, Internal
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.atomic_files import write_atomically
 
@@ -40,7 +40,10 @@ USED = {  # options that --table and --tune use
     "table": {"table", "quick", *OUTPUT},
     "tune": {"tune", "methods", "arenas", "engine", "again", "runs", *OUTPUT},
 }
-OPTIONS = {"engine": "--workers or --ray", "conservatism": "--no-conservatism", "task_settings": "--no-task-settings"}
+OPTIONS = {
+    **{"engine": "--workers or --ray", "conservatism": "--no-conservatism", "task_settings": "--no-task-settings"},
+    "given": "--td3",
+}
 
 Results = list[dict[str, Any]]
 
@@ -87,8 +90,9 @@ class CompareCommand:
     the one in the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
     task_settings: bool = True
     """Train TD3 behind each filter but SAILR with the learner settings of the robot's task, such as the quadrotor's
-    penalty growth and imitation. A --td3 option with another value than its default replaces the task's."""
+    penalty growth and imitation. A --td3 option replaces the task's."""
     td3: TD3Config = field(default_factory=TD3Config)
+    given: Internal[tuple[str, ...]] = ()  # names of the settings in `td3` that options give
     results: Path = RESULTS
     """Store the tables and figures in this folder."""
     runs: Path = RUNS
@@ -97,6 +101,11 @@ class CompareCommand:
     json: Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "train", "logs")
+
+    @classmethod
+    def defaults(cls, arguments: list[str]) -> Self:
+        """Return the default options, with the names of the settings of TD3 that `arguments` give."""
+        return cls(given=given_settings(arguments, "--td3."))
 
     def run(self) -> int:
         """Train, evaluate and write the tables. Returns the exit status."""
@@ -155,7 +164,7 @@ class CompareCommand:
             if getattr(self, mode):
                 names = [item.name for item in fields(self) if getattr(self, item.name) != getattr(usual, item.name)]
                 if unused := [OPTIONS.get(name, f"--{name.replace('_', '-')}") for name in names if name not in used]:
-                    raise ValueError(f"--{mode} ignores {', '.join(unused)}: leave these options out")
+                    raise ValueError(f"--{mode} ignores {', '.join(dict.fromkeys(unused))}: leave these options out")
 
     def _prepared(self, cells: list[CellConfig], results: Path) -> list[CellConfig]:
         """Make the models that several trainings need, and note the model set of a robot of your own.
@@ -212,8 +221,12 @@ class CompareCommand:
         if self.penalty is not None:
             changed["penalty"] = self.penalty
         settings = described.task.learner if self.task_settings else {}
-        own = [replace(cell, td3=learning(self.td3, cell.method, settings)) for cell in cells]
-        chosen = [replace(quick(cell) if self.quick else cell, **changed) for cell in own]
+        ignored = [f"--td3.{name.replace('_', '-')}" for name in self.given if name not in SAC_SETTINGS]
+        for label in {compared(cell.method).label for cell in cells if compared(cell.method).learner == SAC_LEARNER}:
+            if ignored:
+                say(robot, f"{label} has no {', '.join(ignored)}: it learns without")
+        own = [replace(cell, td3=learning(self.td3, cell.method, settings, self.given)) for cell in cells]
+        chosen = [replace(quick(cell, self.given) if self.quick else cell, **changed) for cell in own]
         conservatism = self.conservatism and not self.quick and TRAINED in stored_policies(described)
         return chosen, [Conservatism(robot, task=task_hash(robot))] if conservatism else []
 

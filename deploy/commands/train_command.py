@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -13,7 +13,7 @@ import tyro
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
-from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, in_batches, load
+from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, Internal, RunConfig, in_batches, load
 
 # Names of the options for fields that have another name, or that the command makes from several options.
 RESUMED = {
@@ -21,6 +21,7 @@ RESUMED = {
     **{"learner": "--learner...", "robots_per_actor": "--robots-per-actor or --fleet", "change": "--change..."},
     "rotation": "--rotation...",
 }
+MADE = ("method", "model_config", "accept_bound", "conditions")  # fields that the command makes from other options
 STOPPED = 130  # exit status: the user stopped the run before its last step
 
 
@@ -43,6 +44,7 @@ class TrainCommand(RunConfig):
     verbose: options.Verbose = False
     quiet: options.Quiet = False
     json: options.Json = False
+    continued: Internal[bool] = False  # the options that nobody gives are those of the resumed run
 
     # Options that `--help` leaves to `--help-all`.
     expert: ClassVar[tuple[str, ...]] = (
@@ -57,10 +59,12 @@ class TrainCommand(RunConfig):
     def defaults(cls, arguments: list[str]) -> Self:
         """Return the default options: those of the experiment, the backend and the robots that `arguments` name.
 
+        If they resume a run, its configuration gives the defaults, so that it shows which options ask for another one.
+
         Raises:
             ValueError: there is no such experiment, or a robot's task has a setting that TD3 does not have.
         """
-        named = {"--experiment": cls.experiment, "--backend": cls.backend}
+        named = {"--experiment": cls.experiment, "--backend": cls.backend, "--resume": ""}
         for flag, value in zip(arguments, [*arguments[1:], ""], strict=False):
             option, equals, attached = flag.partition("=")
             if option in named:
@@ -69,6 +73,12 @@ class TrainCommand(RunConfig):
         if name not in EXPERIMENTS:
             raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
         experiment = EXPERIMENTS[name]
+        if named["--resume"] and name == cls.experiment:
+            from brakeline.deploy.run.processes import CONFIG
+
+            with suppress(ValueError):  # `config` tells what is wrong
+                resumed = load(Path(named["--resume"]) / CONFIG)
+                return options.settings_from(cls, resumed, steps=0, continued=True)
         if named["--backend"] == BATCH:
             experiment = in_batches(experiment)
         learner = options.task_learner(experiment.learner, arguments, batch=experiment.backend == BATCH)
@@ -83,6 +93,11 @@ class TrainCommand(RunConfig):
             self._check_resumed(resumed)
             from_logs = self.from_logs or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
+        if self.penalty is not None and not self.actors:
+            raise ValueError(
+                "--penalty is for robots that drive, but --actors is 0: each step of a log has the penalty of its own "
+                "run. Leave out --penalty; --learner.td3.penalty-growth multiplies the penalties of the logs too"
+            )
         return self._config_of_options()
 
     def _check_resumed(self, resumed: RunConfig) -> None:
@@ -93,7 +108,9 @@ class TrainCommand(RunConfig):
         ignored = [
             RESUMED.get(name, f"--{name.replace('_', '-')}")
             for name in names
-            if getattr(asked, name) not in (getattr(usual, name), getattr(resumed, name))
+            if getattr(asked, name) != getattr(resumed, name)
+            # Nobody may have given the usual value.
+            and ((self.continued and name not in MADE) or getattr(asked, name) != getattr(usual, name))
         ]
         if self.out is not None and self.out.resolve() != Path(str(self.resume)).resolve():
             ignored.append("--out")

@@ -7,6 +7,7 @@ env = SafetyWrapper(env, Filter(model), state=state, obstacles=obstacles, action
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -73,6 +74,8 @@ def collect(
         BadData: the recording is not a valid data set, or every episode ends at once, or `acceleration_age` in `info`
             differs between episodes.
     """
+    if chord_deviation is not None and not 0.0 <= chord_deviation < math.inf:
+        raise BadData(f"the chord deviation {chord_deviation} is no length in m")
     driven = _Environment(env, robot, mapping_for_space(env.action_space, robot, actions), state, disturbed)
     with under_way(f"driving {robot.name}", periods) if shown else nullcontext(_ignore) as advance:
         trajectories = _drive(driven, robot, periods, held, seed, options, advance)

@@ -111,11 +111,14 @@ def import_sources(
         hold: time in s for which an input is valid after its last message.
 
     Raises:
-        BadData: there is no source, or one cannot be used; the message names the source and the reason.
+        BadData: there is no source, or one cannot be used; the message names the source and the reason. Or the options
+            do nothing for logs of runs.
         LogError: a Brakeline log cannot be read.
     """
     if not paths:
         raise NoSource("there is no log to import: name one or more files or folders")
+    if all(map(own_log, paths)):
+        _refuse_options(options, delay, hold)
     parts = [_import_one(path, robot, options, delay, hold) for path in paths]
     reports = [part.report for part in parts]
     samples = {report.samples for report in reports}
@@ -145,6 +148,16 @@ def import_sources(
         ),
     )
     return ImportedData(data, report)
+
+
+def _refuse_options(options: LogOptions, delay: float, hold: float) -> None:
+    """Raise NoSource if options are given that logs of runs ignore: they have the robot's own states and inputs."""
+    given = {"--map": options.fields, "--unit": options.units, "--topics": options.topics, "--delay": delay}
+    if ignored := [name for name, value in (given | {"--hold": hold != HOLD}).items() if value]:
+        raise NoSource(
+            f"a log of a run has the coordinates and inputs of the robot, in each of its periods, so that "
+            f"{', '.join(ignored)} would do nothing: leave that out"
+        )
 
 
 def _refuse_copies(paths: Sequence[Path], parts: Sequence[ImportedData]) -> None:

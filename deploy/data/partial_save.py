@@ -17,11 +17,12 @@ class PartialSave:
     """Saves a growing data set to `path`. It does so in a thread, because the caller has a control period to keep."""
 
     def __init__(self, path: Path) -> None:
-        """Prepare to save. An earlier partial data set at `path` moves aside."""
+        """Prepare to save. An earlier partial data set at `path` moves aside, and replaces no other one."""
         self._path, self._pool = path, ThreadPoolExecutor(1, "partial-save")
         self._last: Future[None] | None = None
         if path.exists():
-            aside = path.replace(path.with_suffix(".earlier" + path.suffix))
+            names = (path.with_suffix(f".earlier{number}{path.suffix}") for number in ("", *range(2, 10_000)))
+            aside = path.replace(next(name for name in names if not name.exists()))
             log.warning("an earlier flight was cut off: its data are now in %s", aside)
 
     def offer(self, data: Callable[[], Dataset]) -> None:

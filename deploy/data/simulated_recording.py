@@ -69,7 +69,8 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
     part = partial_path(path)
     restless = math.ceil(RESTLESS_SHARE * trajectories)
     total = trajectories + restless
-    driven = _load_partial(part, robot, origin(robot, seed, conditions, restless))
+    periods = [collect.PERIODS] * trajectories + [collect.RESTLESS_PERIODS] * restless
+    driven = _load_partial(part, robot, origin(robot, seed, conditions, restless), periods)
     before = f", {len(driven)} of them recorded before" if driven else ""
     console.print(
         f"recording {robot.name} once, into {path}: {total} trajectories{before}. You can interrupt it: the next call "
@@ -123,13 +124,17 @@ def _check_replaceable(path: Path, robot: Robot) -> None:
         )
 
 
-def _load_partial(part: Path, robot: Robot, about: dict[str, str]) -> list[Trajectory]:
-    """Return the trajectories of an interrupted recording with the same settings, or an empty list."""
+def _load_partial(part: Path, robot: Robot, about: dict[str, str], periods: list[int]) -> list[Trajectory]:
+    """Return the trajectories of an interrupted recording with the same settings, or an empty list.
+
+    periods: of each trajectory of the whole recording. They differ if the number of trajectories does.
+    """
     try:
         partial = Dataset.load(part)
     except BadData:
         return []
-    if partial.robot.layout() != robot.layout() or partial.about != about:
+    lengths = [len(t.inputs) for t in partial.trajectories]
+    if partial.robot.layout() != robot.layout() or partial.about != about or lengths != periods[: len(lengths)]:
         return []
     return [replace(t, before=None) for t in partial.trajectories]  # each began at rest
 

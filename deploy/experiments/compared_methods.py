@@ -17,6 +17,11 @@ EVERY, BATCHES = "every", "batches"
 BY_HAND = "equations by hand: a unicycle, in the air a lag"
 MAP, RAYS, NOTHING = "the arena's map", "the observed rays", "–"
 TD3_LEARNER, SAC_LEARNER = "TD3", "SAC"
+# Settings of TD3 that SAC has too; its one learning rate is the actor's.
+SAC_SETTINGS = {
+    *("hidden", "actor_rate", "batch", "gamma", "n_step", "tau", "reward_scale", "updates_per_step", "symmetric"),
+    "warmup",
+}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ runs/compare/<robot>/<cell>/               logs and policy of a cell (not in git
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,17 +133,19 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     return "batch"
 
 
-def learning(td3: TD3Config, method: str, settings: Mapping[str, Any]) -> TD3Config:
+def learning(td3: TD3Config, method: str, settings: Mapping[str, Any], given: Collection[str] = ()) -> TD3Config:
     """Return the learner's settings, with those of the method and of the robot's task in place of the defaults.
 
-    settings: `Task.learner`, for TD3 behind a filter that replaces single inputs. SAILR ends an episode instead.
+    Args:
+        settings: `Task.learner`, for TD3 behind a filter that replaces single inputs. SAILR ends an episode instead.
+        given: names of settings that stay as they are in `td3`.
 
     A batch keeps an update for each step. With an update for every fourth one, as `train --backend batch` makes, TD3
     without a filter stood still after 60,000 steps (seed 0); with one for each it reached 493 of 500 goals.
     """
     row = compared(method)
     with_task = row.filter not in (NONE, SAILR) and row.learner == TD3_LEARNER
-    return td3.with_settings({**(settings if with_task else {}), **row.td3})
+    return td3.with_settings({**(settings if with_task else {}), **row.td3}, given)
 
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
@@ -152,9 +154,13 @@ def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name, method in METHODS.items() if method.robots in kinds)
 
 
-def quick(cell: CellConfig) -> CellConfig:
-    """Return a cell that runs in a minute: enough to test the code and end an episode, too short to learn."""
-    td3 = replace(cell.td3, hidden=(64, 64), batch=64, warmup=500)
+def quick(cell: CellConfig, given: Collection[str] = ()) -> CellConfig:
+    """Return a cell that runs in a minute: enough to test the code and end an episode, too short to learn.
+
+    The settings of the learner that are `given` stay.
+    """
+    small: dict[str, Any] = {"hidden": (64, 64), "batch": 64, "warmup": 500}
+    td3 = replace(cell.td3, **{name: value for name, value in small.items() if name not in given})
     return replace(cell, steps=4_000, robots=8, episodes=10, untrained=5, td3=td3)
 
 

@@ -62,9 +62,10 @@ class LoggedSteps:
 
     def __iter__(self) -> Iterator[pb.Step]:
         check_logs(self.logs, self.robot)
-        intake, known = StepReader(self.robot), set[tuple[str, int, int]]()
+        intake, starts = StepReader(self.robot), _Starts()
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
-            ledger, sessions, copied = StepLedger(), _Sessions(), dict[tuple[str, int], bool]()
+            ledger, sessions = StepLedger(), _Sessions()
+            starts.begin_log()
             log_of_run = open_log(files)
             for record in log_of_run:
                 if record.topic != "step" or record.message.robot != self.robot.name:
@@ -76,7 +77,7 @@ class LoggedSteps:
                     self.counts["unusable"] += 1
                     self.reason = self.reason or str(error)
                     continue
-                if _is_copied(step, copied, known):
+                if starts.is_copied(step):
                     self.counts["duplicate"] += 1
                     continue
                 step.actor = sessions.name(step)
@@ -103,18 +104,27 @@ def check_logs(logs: Sequence[str], robot: RobotWithTask) -> None:
         check_described(path, robot, log_file.metadata.get("robots", {}).get(robot.kind, ""), SCALES)
 
 
-def _is_copied(step: pb.Step, copied: dict[tuple[str, int], bool], known: set[tuple[str, int, int]]) -> bool:
-    """Return whether an earlier log has the steps of this start of the actor. A folder may have a copy of a log.
+class _Starts:
+    """Tells which steps of a log an earlier log has. A folder may have a copy of a log, also of its first part only."""
 
-    Args:
-        copied: the starts in this log, and whether an earlier log has them; known: the first step of each start.
-    """
-    start = step.actor, step.header.run
-    if start not in copied:
-        first = (*start, step.header.wall_time)
-        copied[start] = step.header.wall_time > 0 and first in known
-        known.add(first)
-    return copied[start]
+    def __init__(self) -> None:
+        self._earlier: dict[tuple[str, int], tuple[int, int]] = {}  # by start of an actor: its first and last step [ns]
+        self._here: dict[tuple[str, int], tuple[int, int]] = {}
+
+    def begin_log(self) -> None:
+        """Note that the next step is of another log."""
+        for start, (first, last) in self._here.items():
+            known = self._earlier.get(start)
+            self._earlier[start] = (first, last) if known is None or known[0] != first else (first, max(last, known[1]))
+        self._here = {}
+
+    def is_copied(self, step: pb.Step) -> bool:
+        """Return whether an earlier log has this step: the same start of its actor, up to this time or a later one."""
+        start, now = (step.actor, step.header.run), step.header.wall_time
+        first, last = self._here.get(start, (now, now))
+        self._here[start] = first, max(last, now)
+        known = self._earlier.get(start)
+        return known is not None and now > 0 and known[0] == first and now <= known[1]
 
 
 class _Sessions:

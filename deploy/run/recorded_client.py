@@ -97,6 +97,8 @@ class RecordedClient:
         self._complete: pb.Step | None = None  # the one before: it waits, since the episode may end with it
         self._asked_at = 0.0  # time of the latest request [s]
         self._before: Array | None = None  # the state before the current period, if a request had it
+        self._latest: Array | None = None  # the state of the episode's latest request
+        self._unmeasured = pb.Step()  # the outcomes of periods whose end no request had: they count for the next one
         self._near = Shapes.of([], client.robot.position_dim)
         self._closed = threading.Event()
         self._writer = threading.Thread(target=self._write, name=f"log {self.path}", daemon=True)
@@ -160,9 +162,11 @@ class RecordedClient:
 
         A reward that is not finite, or 1e9 and more, counts as zero, because a log with it has no sums.
         """
+        reward = reward if abs(reward) < MAX_VALUE else 0.0
         if self._pending is not None:
-            self._pending.reward = reward if abs(reward) < MAX_VALUE else 0.0
-            self._pending.goal, self._pending.collision = goal, collision
+            self._pending.reward, self._pending.goal, self._pending.collision = reward, goal, collision
+        elif self._latest is not None:  # `decide` failed, and the program stops the robot without `fallback`
+            _add_outcome(self._unmeasured, pb.Step(reward=reward, goal=goal, collision=collision))
 
     def reset(self, *, goal: bool = False, collision: bool = False) -> None:
         """End the episode and begin the next one with a robot that stands still. The arguments say how it ended."""
@@ -191,6 +195,7 @@ class RecordedClient:
         """Note what the robot executes in this period; without an answer, it is the backup plan's input."""
         if self._pending is not None:  # the period before had no request, so nobody measured its end
             self._before = None
+            _add_outcome(self._unmeasured, self._pending)
         finite = bool(np.isfinite(proposed := np.fromiter(proposed, float)).all())
         step = pb.Step(
             robot=self.robot.name,
@@ -211,6 +216,7 @@ class RecordedClient:
     def _finish_step(self, request: pb.Request) -> None:
         """Complete the step of the last period with the state of a request, which is the state after it."""
         step, self._pending, self._asked_at = self._pending, None, request.time
+        self._latest = np.array(request.state)
         if step is None:
             self._before = np.array(request.state)
             return
@@ -228,6 +234,7 @@ class RecordedClient:
         """Note the state at the end of a period. The step waits for the next one: the episode may end with it."""
         self._index += 1
         step.index = self._index
+        self._take_unmeasured(step)
         step.state.extend(state.tolist())
         step.header.time = time
         distances = self._near.distance(state[: self.robot.position_dim])
@@ -237,18 +244,25 @@ class RecordedClient:
     def _end_episode(self, goal: bool = False, collision: bool = False) -> None:
         """Mark the last complete step as the episode's end. The period after it has no measured end, so no step."""
         last = self._pending
-        if self._complete is None and last is not None and self._before is not None:
-            self._complete_step(last, self._before, self._asked_at)  # the only period: else its outcome would be lost
+        if self._complete is None and last is not None and self._latest is not None:
+            self._complete_step(last, self._latest, self._asked_at)  # the only period: else its outcome would be lost
         if (end := self._complete) is not None:
-            if last is not None:
-                end.reward += last.reward if last is not end else 0.0
-                goal, collision = goal or last.goal, collision or last.collision
+            if last is not None and last is not end:
+                _add_outcome(self._unmeasured, last)
+            goal = goal or self._unmeasured.goal or (last is end and end.goal)
+            self._take_unmeasured(end)
             end.goal, end.collision = goal, collision or end.collision
             end.terminated = end.goal or end.collision
             end.truncated = not end.terminated
         self._put_complete()
         self._episode += bool(self._step)
-        self._pending, self._before, self._step = None, None, 0
+        self._pending, self._before, self._latest, self._step = None, None, None, 0
+        self._unmeasured.Clear()
+
+    def _take_unmeasured(self, step: pb.Step) -> None:
+        """Let a step have the outcomes of the periods before it without a measured end."""
+        _add_outcome(step, self._unmeasured)
+        self._unmeasured.Clear()
 
     def _put_complete(self) -> None:
         if self._complete is not None:
@@ -267,6 +281,12 @@ class RecordedClient:
     def _write(self) -> None:
         while not self._closed.wait(PERIOD):
             self._recording.save()
+
+
+def _add_outcome(step: pb.Step, other: pb.Step) -> None:
+    """Add the outcome of another period to that of a step."""
+    step.reward += other.reward
+    step.goal, step.collision = step.goal or other.goal, step.collision or other.collision
 
 
 def _recording(path: Path, client: FilterClient, inbox: Inbox) -> Recording:

@@ -133,6 +133,8 @@ class Dataset:
         robot = self.robot
         if not self.trajectories:
             raise BadData("the data set holds no trajectory")
+        if not 0.0 <= self.chord_deviation < math.inf:
+            raise BadData(f"the chord deviation {self.chord_deviation!r} is no length")
         for i, t in enumerate(self.trajectories):
             periods = len(t.inputs)
             shapes = t.states.shape, t.inputs.shape, t.paths.shape, t.turned.shape

@@ -32,9 +32,11 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.stated_share import percent
 from brakeline.safety import methods
 from brakeline.safety.model import model_config
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.validation import ValidationReport
 from tests.deploy.data.porter import FILE, drive, write_csv
+from tests.robots import QUADROTOR
 from tests.waiting import until
 
 SHARED = {
@@ -192,6 +194,15 @@ def test_certify_refuses_too_little_data_with_status_1(command, figures, tmp_pat
     assert status == 1 and "at least" in err
     assert "refused" in json.loads(out)["residual"]
     assert "encoder ticks" not in command(*words)[1], "the conditions need --verbose"
+
+
+def test_certify_refuses_data_of_another_robot_than_the_named_one(command, tmp_path):
+    """It certified the recorded robot, and put that to use, whatever body the named description had."""
+    still, inputs = np.zeros(QUADROTOR.state_dim), np.zeros((9, QUADROTOR.action_dim))
+    drive = Trajectory(np.tile(still, (10, 1)), inputs, np.zeros((9, 1, 3)), np.zeros(9))
+    Dataset(QUADROTOR, (drive,), {}).save(tmp_path / "data.safetensors")
+    status, _, err = command("certify", FILE, "--data", tmp_path / "data.safetensors", "--use")
+    assert status == 1 and "has data of quadrotor, not of porter: certify quadrotor, or import the log" in err
 
 
 def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(

@@ -18,6 +18,7 @@ from brakeline.logs.log_export import to_foxglove
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, by_run, find, read
+from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import (
     ABOUT,
@@ -319,11 +320,13 @@ def test_a_copy_of_a_log_in_its_folder_counts_once(tmp_path: Path, name: str, ca
     """A backup, and a longer copy with pictures; the run itself has two files. Another run in the folder counts."""
     mixed(tmp_path, episodes=4)
     alone = analyse_runs(tmp_path).figures()
+    open_segment(tmp_path / "run.mcap", ABOUT).finish()  # of a recorder that ended before the first message
+    alone["log"].append(str(tmp_path / "run_0002.mcap"))
     shutil.copy(tmp_path / "run.mcap", tmp_path / name)
     to_foxglove(Log(find(tmp_path / "run.mcap")), tmp_path / "pictures.mcap")
     figures = analyse_runs(tmp_path).figures()
     assert list(figures["runs"]) == [tmp_path.name]
-    assert {**figures, "segments": None} == {**alone, "segments": None}
+    assert {**figures, "segments": None, "runs": None} == {**alone, "segments": None, "runs": None}
     assert f"{name} is a copy of" in caplog.text and "run.mcap is a copy" not in caplog.text
     assert sum(1 for _ in read(tmp_path)) == sum(1 for _ in read(tmp_path / "run.mcap"))
     shutil.copy(mixed(tmp_path / "other", seed=1, episodes=2) / "run.mcap", tmp_path / "other.mcap")

@@ -71,6 +71,30 @@ def test_it_says_in_words_how_sure_a_model_set_is(analysis: LogAnalysis) -> None
     assert "up to 60 %, if steps are independent." in whole
 
 
+def test_it_has_what_was_driven_by_kind_beside_what_is_stated(analysis: LogAnalysis) -> None:
+    [(label, (figures, pictures))] = analysis.by_label().items()
+    kinds = {
+        "standing": {"windows": 7, "outside": 2, "excess": 1.5, "bound": 0.0125},
+        "fast": {"windows": 5000, "outside": 0, "excess": 0.9, "bound": None},
+        "jumping <inputs>": {"windows": 1, "outside": 1, "excess": float("inf"), "bound": 1.0},
+    }
+    page = render(analysis.figures(), {label: (figures | {"driving": {"ground": kinds}}, pictures)})
+    table = re.search(r"<table[^>]*><thead><tr><th>driving of ground</th>.*?</table>", page, re.DOTALL)
+    assert table is not None
+    head, *rows = re.findall(r"<tr>(.*?)</tr>", table[0], re.DOTALL)
+    texts = [[unescape(cell) for cell in re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row)] for row in (head, *rows)]
+    assert texts == [
+        ["driving of ground", "windows", "outside the stated sets", "share", "stated, of plans"],
+        ["standing", "7", "2", "28.6 %", "≤ 1.3 %"],
+        ["fast", "5\u202f000", "0", "0.0 %", "–"],
+        ["jumping <inputs>", "1", "1", "100.0 %", "≤ 100 %"],
+    ]
+    values = dict(re.findall(r'data-figure="driving\.ground\.([^"]*)"\s+data-value="([^"]*)"', table[0]))
+    assert {unescape(name): json.loads(value) for name, value in values.items()} == {
+        f"{kind}.{name}": row[name] for kind, row in kinds.items() for name in ("windows", "outside", "bound")
+    }
+
+
 def test_it_needs_no_network_and_no_other_file(report: Report) -> None:
     text = report[0].read_text()
     assert "default-src 'none'" in text

@@ -87,6 +87,9 @@ def test_wrong_sizes_bounds_and_boundaries_are_refused(small):
     for parts in ({"inputs": with_value(t.inputs, -0.1)}, {"before": np.array([0.0, 0.7])}):
         with pytest.raises(BadData, match="out of the robot's bounds"):
             changed(small, **parts).check()
+    for length in (-0.01, np.nan, np.inf):
+        with pytest.raises(BadData, match=r"chord deviation .* is no length"):
+            replace(small, chord_deviation=length).check()
     for check in (Dataset.check, lambda data: windows(data, 1)):
         with pytest.raises(BadData, match="no trajectory"):
             check(replace(small, trajectories=()))

@@ -525,6 +525,13 @@ def test_collecting_states_how_far_the_path_leaves_the_lines_between_the_samples
     assert 0.0 < away <= data.chord_deviation < 6.0 * away
 
 
+def test_collecting_refuses_a_chord_deviation_that_is_no_length_before_it_drives():
+    env = Toy(PUCK)
+    with pytest.raises(BadData, match=r"the chord deviation .* is no length"):
+        collect(env, PUCK, 60, state=seen, actions=normalised(PUCK), chord_deviation=-0.01, shown=False)
+    assert not hasattr(env, "count")
+
+
 def test_collecting_gives_up_if_every_episode_ends_at_once():
     with pytest.raises(BadData, match="in a row ended before period"):
         collect(Toy(CAR, [Obstacle("cylinder", (0.0, 0.0), (0.1,))]), CAR, 10, state=seen, actions=normalised(CAR))

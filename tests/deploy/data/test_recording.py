@@ -17,6 +17,7 @@ from brakeline.deploy.data import collect, data_paths, model_store, patient_save
 from brakeline.deploy.data.build_lock import LOCK
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.excitation import excitation, restless_excitation
+from brakeline.deploy.data.partial_save import PartialSave
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
 from brakeline.errors import BadData, BadModel, NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
@@ -325,6 +326,17 @@ def test_the_last_steps_of_a_log(tmp_path):
         from_log(written(tmp_path / "none.mcap", ()), GROUND, last=60)
 
 
+def test_options_that_a_log_of_a_run_ignores_are_refused(tmp_path, capsys):
+    made = [(f"step/ground/{step.actor}", step, i) for i, step in enumerate(steps("a", 0, range(50)))]
+    log, out = str(written(tmp_path / "run.mcap", made)), str(tmp_path / "data.safetensors")
+    words = ["import", log, "--robot", "ground", "--out", out]
+    for ignored in ("--delay", "0.1"), ("--hold", "2"), ("--unit", "heading=deg"), ("--map", "speed=v"):
+        assert main([*words, *ignored]) == 1
+        assert f"{ignored[0]} would do nothing: leave that out" in " ".join(capsys.readouterr().err.split())
+    main(words)
+    assert "would do nothing" not in capsys.readouterr().err
+
+
 def test_steps_of_another_description_are_refused(tmp_path):
     """A step of 0.2 s is none of 0.1 s, and a state in another order is another state. A plan may be longer."""
     made = [(f"step/ground/{step.actor}", step, i) for i, step in enumerate(steps("a", 0, range(50)))]
@@ -357,6 +369,33 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch,
     again = data_paths.record_path(GROUND).with_name("fresh.safetensors")
     fresh = simulated_recording.load_or_record(GROUND, again, trajectories=4)
     assert whole.digest() == fresh.digest(), "the same data as in one go"
+
+
+def test_an_interrupted_recording_of_another_number_of_trajectories_is_not_gone_on_from(short, monkeypatch, tmp_path):
+    """With 4 trajectories there are as many restless ones as with 3, but they begin one place later."""
+    parts, path = collect.record_parts, tmp_path / "record.safetensors"
+
+    def interrupted(*given):
+        yield next(parts(*given))[:5]
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(collect, "record_parts", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulated_recording.load_or_record(GROUND, path, trajectories=4)
+    other = simulated_recording.load_or_record(GROUND, path, trajectories=3)
+    fresh = simulated_recording.load_or_record(GROUND, tmp_path / "fresh.safetensors", trajectories=3)
+    assert other.digest() == fresh.digest() and len(other.steady().trajectories) == 3
+
+
+def test_flights_that_were_cut_off_replace_each_other_nowhere(tmp_path):
+    part = tmp_path / "flown.part.safetensors"
+    for flight in (b"first", b"second", b"third"):
+        part.write_bytes(flight)
+        PartialSave(part).finish()
+    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    names = (f"flown.part.earlier{number}.safetensors" for number in ("", 2, 3))
+    assert kept == dict(zip(names, (b"first", b"second", b"third"), strict=True))
 
 
 def test_a_killed_recording_loses_no_trajectory_that_is_finished(short, monkeypatch, tmp_path):

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from brakeline.deploy.cli import parse
 from brakeline.deploy.commands import compare_command
 from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.commands.collect_command import CollectCommand
@@ -333,6 +334,27 @@ def test_methods_whose_filter_replaces_inputs_have_the_learner_of_the_task():
             ("quadrotor",), (0,), methods=("ddpc",), conservatism=False, task_settings=wanted
         )._jobs("quadrotor")
         assert (job.td3.imitation > 0.0) == wanted
+
+
+def test_a_setting_that_an_option_gives_stays_also_with_its_default_value(monkeypatch):
+    """The table of SAC says 0.0003 and 0.003, the quadrotor's task a penalty growth, and --quick a small batch."""
+    words = "compare quadrotor --seeds 0 --no-conservatism --quick --methods"
+    monkeypatch.setattr(compare_command, "import_module", lambda _: None)
+    said = []
+    monkeypatch.setattr(compare_command, "say", lambda *words: said.append(words))
+    for method, name, option, value in (
+        ("sac-ddpc", "actor_rate", "--td3.actor-rate=0.0003", 3e-4),
+        ("ddpc", "penalty_growth", "--td3.penalty-growth 1", 1.0),
+        ("ddpc", "batch", "--td3.batch 128", 128),
+        ("sac-ddpc", "imitation", "--td3.imitation 0", 0.0),
+    ):
+        plain, given = (parse("compare", f"{words} {method} {more}".split()[1:]) for more in ("", option))
+        ((usual,), _), ((chosen,), _) = (command._jobs("quadrotor") for command in (plain, given))
+        assert getattr(chosen.td3, name) == value and (getattr(usual.td3, name) != value or name == "imitation")
+    assert said == [("quadrotor", "SAC, our filter has no --td3.imitation: it learns without")]
+    with pytest.raises(ValueError, match="--table ignores --td3: leave"):
+        parse("compare", ["--table", "--td3.batch", "128"]).run()
+    assert learning(TD3Config(), "lagrange", {}, {"cost_limit"}).cost_limit is None
 
 
 def test_a_penalty_out_of_proportion_for_any_robot_is_refused_before_the_first_training(monkeypatch):

@@ -90,6 +90,17 @@ def test_a_copy_of_a_log_in_its_folder_teaches_nothing_twice(tmp_path: Path) -> 
     assert len(names(steps_of_folder)) == 6 and steps_of_folder.counts == {"taken": 6, "duplicate": 3}
 
 
+@pytest.mark.parametrize("copy", ["a.mcap", "z.mcap"])
+def test_a_copy_of_the_first_part_of_a_log_hides_nothing(tmp_path: Path, copy: str) -> None:
+    """Somebody copied the log while its run went on. The copy may be read before the log, or after it."""
+    steps = [step(i, header=pb.Header(run=1, wall_time=10**9 + i)) for i in range(9)]
+    record(tmp_path / copy, *steps[:4])
+    record(tmp_path / "run.mcap", *steps)
+    fed = LoggedSteps([str(tmp_path)], GROUND)
+    assert sorted(number for _, _, number in names(fed)) == list(range(9))
+    assert fed.counts == {"taken": 9, "duplicate": 4}
+
+
 def test_two_sessions_of_an_actor_in_one_log_are_two_actors_and_a_restart_is_one(tmp_path: Path) -> None:
     first = [step(i, header=pb.Header(run=1)) for i in range(2)]
     restarted = [step(i, episode=1, header=pb.Header(run=2)) for i in range(2)]

@@ -110,6 +110,35 @@ def test_no_stated_collision_is_lost(method, tmp_path, figures) -> None:
     assert first.clearance == pytest.approx(0.5 - method.robot.footprint)
 
 
+def test_the_outcome_of_a_period_without_a_measured_end_is_not_lost(method, tmp_path, figures) -> None:
+    """After it the program brakes without a request: at the end of an episode, or within one."""
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        for lead in (1, 3):
+            drive(safety, lead)
+            safety.record_outcome(-1.0, collision=True)
+            safety.fallback()
+            safety.record_outcome(-0.5)
+            safety.reset()
+            drive(safety, lead)
+            safety.record_outcome(-1.0, collision=True)
+            for _ in range(2):
+                safety.fallback()
+            drive(safety, 2)
+            safety.reset()
+        drive(safety, 2)
+        safety.record_outcome(1.0, goal=True)
+        safety.fallback()
+        safety.reset()
+        drive(safety, 2)
+        with pytest.raises(BadRequest):
+            safety.decide([0.0] * 5, [0.2, 0.0])  # and no `fallback`: the program stops by itself
+        safety.record_outcome(-1.0, collision=True)
+    counted = figures("analyse", safety.path)
+    assert (counted["episodes"], counted["collisions"], counted["goals"]) == (6, 5, 1)
+    assert counted["mean_reward"] == (-1.5 - 1.0 - 1.5 - 1.0 + 1.0 - 1.0) / 6
+    assert all(len(step.state) == 5 for step in messages(safety.path, "step"))
+
+
 def test_the_log_says_when_a_state_left_its_predicted_set(method, tmp_path) -> None:
     with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
         for x in (0.0, 0.001, 0.0, 0.3, 0.301, 0.3):  # it stands, and its position jumps once

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.actor_settings import PhysicsChange
+from brakeline.deploy.cli import parse
 from brakeline.deploy.commands.common_options import ServiceOptions
 from brakeline.deploy.commands.fly_command import FlyCommand
 from brakeline.deploy.commands.train_command import TrainCommand
@@ -123,6 +124,12 @@ def test_the_options_start_from_the_experiment(tmp_path: Path) -> None:
         TrainCommand.defaults(["--experiment", "debag"])
 
 
+def test_a_penalty_without_robots_is_refused() -> None:
+    with pytest.raises(ValueError, match="--penalty is for robots that drive"):
+        parse("train", ["--from-logs", "runs/a", "--actors", "0", "--penalty", "5"]).config()
+    assert parse("train", ["--from-logs", "runs/a", "--actors", "1", "--penalty", "5"]).config().penalty == 5.0
+
+
 def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(encode(CHANGED))
     resume = replace(TrainCommand.defaults(["ground"]), resume=tmp_path)
@@ -130,6 +137,21 @@ def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path)
     assert replace(resume, steps=5).config() == replace(CHANGED, steps=5)
     assert replace(resume, arena="dense", deadline=0.25, out=tmp_path, actors=2).config() == CHANGED, "the same again"
     assert replace(resume, from_logs=("log",)).config() == replace(CHANGED, from_logs=("log",))
+
+
+def test_a_resumed_run_refuses_an_option_with_the_usual_value_if_it_has_another_one(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(encode(CHANGED))
+    words = ["--resume", str(tmp_path)]
+    assert parse("train", words).config() == CHANGED
+    assert parse("train", [*words, "--steps", "5"]).config() == replace(CHANGED, steps=5)
+    same = [*words, "--arena", CHANGED.arena, "--seed", str(CHANGED.seed), "--actors", str(CHANGED.actors)]
+    assert parse("train", same).config() == CHANGED
+    usual = RunConfig()
+    assert usual.arena != CHANGED.arena
+    with pytest.raises(ValueError, match="asked for by --arena: leave that out"):
+        parse("train", [*words, "--arena", usual.arena]).config()
+    with pytest.raises(ValueError, match="is no run's configuration"):
+        parse("train", ["--resume", str(tmp_path / "none")]).config()
 
 
 @pytest.mark.parametrize(
