@@ -44,7 +44,7 @@ def _ask(settings: BusSettings, payloads: list[bytes], clients: int, out: Connec
     """Run clients with phases of their own for `SECONDS`.
 
     Sends the times of the answered requests [s], and the numbers of late, unanswered and skipped requests: a request
-    is skipped if the threads were still busy when the next one was due.
+    is skipped if the threads were still busy when the next one was due, or at the end.
     """
     requests = [pb.Request.FromString(payload) for payload in payloads]
     rng, lock = np.random.default_rng(clients), threading.Lock()
@@ -52,18 +52,19 @@ def _ask(settings: BusSettings, payloads: list[bytes], clients: int, out: Connec
     with ExitStack() as stack:
         buses = [stack.enter_context(Bus(settings, f"client.{i}")) for i in range(SESSIONS)]
         begun = time.monotonic() + 0.5
+        end = begun + SECONDS
         due = [(begun + float(phase), number) for number, phase in enumerate(rng.uniform(0.0, 1.0 / RATE, clients))]
         heapq.heapify(due)
 
         def work(bus: Bus) -> None:
-            while True:
+            while (now := time.monotonic()) < end:
                 with lock:
                     at, number = heapq.heappop(due)
-                    missed = max(0, int((time.monotonic() - at) * RATE))
+                    missed = max(0, int((now - at) * RATE))
                     counts["skipped"] += missed
                     at += missed / RATE
                     heapq.heappush(due, (at + 1.0 / RATE, number))
-                if at > begun + SECONDS:
+                if at > end:
                     return
                 time.sleep(max(0.0, at - time.monotonic()))
                 before = time.perf_counter()
@@ -80,6 +81,7 @@ def _ask(settings: BusSettings, payloads: list[bytes], clients: int, out: Connec
             thread.start()
         for thread in threads:
             thread.join()
+    counts["skipped"] += sum(int((end - at) * RATE) + 1 for at, _ in due if at <= end)
     out.send_bytes(json.dumps([answered, counts]).encode())
 
 

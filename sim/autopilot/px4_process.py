@@ -143,12 +143,13 @@ class Px4Process:
         self._listener.settimeout(0.1)
         while time.monotonic() < end and self.alive and not stop():
             try:
-                connection = self._listener.accept()[0]
+                connection, (_, peer) = self._listener.accept()
             except TimeoutError:
                 continue
-            if _belongs_to(connection, self._process.pid):
+            port = connection.getsockname()[1]
+            if _belongs_to(peer, port, self._process.pid):
                 return connection
-            log.warning("another program than PX4 connected to PX4's simulator at port %d", connection.getsockname()[1])
+            log.warning("another program than PX4 connected to PX4's simulator at port %d", port)
             connection.close()
         if stop():
             raise LaunchError("asked to stop before PX4 had started")
@@ -164,9 +165,8 @@ def _find_parts(folder: Path) -> tuple[Path, Path, Path]:
     raise LaunchError(f"{folder} holds no PX4 for SITL: it must have px4 and px4-alias.sh (or both in bin/), and etc/")
 
 
-def _belongs_to(connection: socket.socket, session: int) -> bool:
-    """Return whether the other end of a connection on this machine is a process of this session, by the kernel."""
-    (_, peer), (_, own) = connection.getpeername(), connection.getsockname()
+def _belongs_to(peer: int, own: int, session: int) -> bool:
+    """Return whether a process of this session has the port `peer`, connected to our port `own`, by the kernel."""
     rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     ends = f":{peer:04X}", f":{own:04X}"
     names = {f"socket:[{row[9]}]" for row in rows if (row[1][-5:], row[2][-5:]) == ends}

@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -49,17 +50,19 @@ def test_the_first_program_that_connects_is_not_px4(build, caplog) -> None:
     def stop() -> bool:  # is asked before each wait for a connection
         if not strangers:
             instance = next(n for n in px4_process.INSTANCES if not port_is_free(FIRST_PORT + n))
-            strangers.append(socket.create_connection(("127.0.0.1", FIRST_PORT + instance)))
+            strangers.extend(socket.create_connection(("127.0.0.1", FIRST_PORT + instance)) for _ in range(2))
+            strangers[0].setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            strangers[0].close()  # reset, before anybody accepts it
             (build.parent / "GO").touch()
         return False
 
     px4 = Px4Process(build, 14540, stop=stop)
     try:
         assert px4.connection.recv(3) == b"px4"
-        assert strangers[0].recv(1) == b"" and "another program than PX4" in caplog.text
+        assert strangers[1].recv(1) == b"" and "another program than PX4" in caplog.text
     finally:
         px4.close()
-        strangers[0].close()
+        strangers[1].close()
     assert not left(build)
 
 

@@ -88,7 +88,7 @@ def main() -> None:
     driver = Driver()
     kind = "geometry_msgs/msg/Twist"
     place = {"router_ip": "127.0.0.1", "router_port": PORT, "domain_id": 0}
-    scans = ROS2Subscriber(
+    _scans = ROS2Subscriber(
         "/scan",
         "sensor_msgs/msg/LaserScan",
         driver.scan,
@@ -96,7 +96,7 @@ def main() -> None:
         type_hash=digest("sensor_msgs/msg/LaserScan"),
         **place,
     )
-    commands = ROS2Subscriber("/cmd_vel", kind, driver.command, definition(kind), type_hash=digest(kind), **place)
+    _commands = ROS2Subscriber("/cmd_vel", kind, driver.command, definition(kind), type_hash=digest(kind), **place)
     raw = ROS2Publisher(RAW, kind, definition(kind), node_name="rammer", type_hash=digest(kind), **place)
     vector = raw.session_mgr.store.types["geometry_msgs/msg/Vector3"]
     reported = time.monotonic()
@@ -115,7 +115,6 @@ def main() -> None:
                 figures["delays"] = driver.delays[-200:]
             print(json.dumps(figures), flush=True)
         time.sleep(PAUSE)
-    del scans, commands
 
 
 if __name__ == "__main__":
