@@ -51,7 +51,12 @@ def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Are
         arena = _arena(name, kind, obstacles, start, goal)
         if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
             return arena if kind.movers is None else _with_movers(arena, kind.movers, rng)
-    raise NoArena(f"none of {ATTEMPTS} drawn arenas {name!r} has a path from start to goal; leave it more room")
+    raise NoArena(
+        f"none of {ATTEMPTS} drawn arenas {name!r} has a path from start to goal for a robot with a radius of "
+        f"{robot.footprint:.2g} m. In [arenas.{name}] of the task's file, increase half_width ({kind.half_width:g} m), "
+        f"or decrease the numbers and sizes of obstacles, gap ({kind.gap:g} m), path_clearance "
+        f"({kind.path_clearance:g} m) or goal_distance ({kind.goal_distance:g} m)"
+    )
 
 
 def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: int) -> tuple[Arena, ...]:

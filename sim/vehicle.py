@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
-from brakeline.messaging.obstacle import Array, rotate
+from brakeline.messaging.body_clearance import body_clearance
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
 from brakeline.sim.grid_planner import nearest_distances
@@ -83,22 +83,13 @@ class SimulatedVehicle:
     measured: Array
     input: Array
 
-    @cached_property
-    def _discs(self) -> tuple[Array, Array]:
-        """The centers (K, d) of the body's discs in the robot's frame, and their radii (K,) [m]."""
-        body = self.robot.body
-        return np.array([disc.at for disc in body]), np.array([disc.radius for disc in body])
-
     def clearance(self, states: Array) -> Array:
         """Return the distance [m] from the body in states (..., n) to the nearest obstacle, or inf.
 
         Of a robot without a heading, and of a disc about the position, positions (..., d) are enough.
         """
-        if (heading := self.robot.heading) is not None and any(disc.arm > 0.0 for disc in self.robot.body):
-            centers, radii = self._discs
-            turned = rotate(np.broadcast_to(centers, (*states.shape[:-1], *centers.shape)), states[..., heading, None])
-            apart = self.arena.shapes.distance(states[..., None, :2] + turned).min(axis=0) - radii
-            return np.asarray(apart.min(axis=-1))
+        if self.robot.heading is not None and any(disc.arm > 0.0 for disc in self.robot.body):
+            return body_clearance(self.robot, self.arena.shapes, states)
         positions = states[..., : self.robot.position_dim]
         distances = nearest_distances(self.arena.shapes, positions.reshape(-1, self.robot.position_dim))
         return np.asarray(distances.reshape(positions.shape[:-1]) - self.robot.footprint)

@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
 from brakeline.deploy.commands.common_options import Json, LogReadOptions, Unprefixed
 from brakeline.deploy.data.description_summary import summary
-from brakeline.errors import BadDescription, MissingExtra, NoSource, UnknownTask
+from brakeline.errors import BadDescription, MissingExtra, NoArena, NoSource, UnknownTask
 from brakeline.logs.stacking_table import plain_table
 from brakeline.messaging.description_model import NAME
 from brakeline.messaging.robot import robot_named
@@ -84,10 +85,11 @@ class RobotCommand:
         remarks, tasked, collect = summary(robot)["remarks"], robot_maybe_with_task(self.file), ""
         if isinstance(tasked, RobotWithTask):
             problems, missing = _code_problems(tasked.task)
+            problems += _arena_problems(tasked)
             remarks, collect = [*remarks, *missing], f", or `brakeline collect {self.file}`"
             if problems:
                 lines = "".join(f"\n  {place}: {what}" for place, what in problems)
-                return self._refuse(problems, f"{robot.name}: the task names code that cannot be used:{lines}")
+                return self._refuse(problems, f"{robot.name}: the task has mistakes:{lines}")
         print_result(
             self.json,
             {"file": self.file, "problems": [], "remarks": remarks},
@@ -142,6 +144,19 @@ def _code_problems(task: Task) -> tuple[list[tuple[str, str]], list[str]]:
         except MissingExtra as error:
             missing[f"the code of the task was not checked: {error}"] = None
     return problems, list(missing)
+
+
+def _arena_problems(robot: RobotWithTask) -> list[tuple[str, str]]:
+    """Draw each arena of a task. Return (field, mistake) pairs for those in which the robot has no path to its goal."""
+    from brakeline.sim.arena_generator import draw_arena
+
+    problems = list[tuple[str, str]]()
+    for name in robot.task.arenas:
+        try:
+            draw_arena(name, np.random.default_rng(0), robot)
+        except NoArena as error:
+            problems.append((f"arenas.{name}", str(error)))
+    return problems
 
 
 def _task_text(name: str) -> str:

@@ -27,6 +27,7 @@ MAX_LAG = 1.0  # s
 FEWEST_SPANS = 20  # fewer spans give no result
 LIKE_UNIT = 0.06  # largest relative difference of a gain from a unit's: km/h and ft/s differ by 10 %
 ALIKE = 1.5  # largest ratio of two gains with one cause: noise and curved paths change them a little
+LEAST_TURN = 0.5  # rad: a heading that changes less shows no unit
 HEADING_UNITS = ("rad", "deg", COMPASS)
 UNCONVERTED = "unconverted"  # the reading of a heading without the conversion by --unit
 WORDS = {"deg": "degrees", COMPASS: "a compass heading (degrees, clockwise from y)"}
@@ -49,12 +50,8 @@ def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str], give
         units: SI unit that each column should have.
         given: units from which columns were converted, as `--unit` says.
     """
-    if heading:
-        unit, score = heading_unit(log, heading, given.get(heading, ""))
-        if unit == UNCONVERTED:
-            return [needless_conversion(heading, given[heading], "rad")]
-        if unit != "rad":
-            return [heading_contradiction(heading, unit, score)]
+    if heading and (problem := heading_problem(log, heading, given)):
+        return [problem]
     speeds = speeds_of_motion(log, heading)
     gains: dict[str, SpeedFit] = {}
     for name, unit in units.items():
@@ -81,8 +78,15 @@ def needless_conversion(name: str, given: str, si: str) -> str:
     return f"{name} is in {si} already: only without {option} does the motion agree with it. Leave it out"
 
 
-def heading_contradiction(name: str, unit: str, score: float) -> str:
-    """Return the sentence for a heading that the motion follows in another unit only."""
+def heading_problem(log: AlignedLog, name: str, given: Mapping[str, str]) -> str:
+    """Return the sentence for a heading that is not in rad, by the motion or else by the speeds; empty if it may be."""
+    unit, score = heading_unit(log, name, given.get(name, ""))
+    if unit == "rad" and score <= SAME_CORRELATION:
+        unit, score = _clear(speed_scores(log, name, given.get(name, "")))
+    if unit == "rad":
+        return ""
+    if unit == UNCONVERTED:
+        return needless_conversion(name, given[name], "rad")
     return (
         f"{name} looks like {WORDS[unit]}: in that unit, the motion agrees with it ({score:.0%}), in rad it does not. "
         f"Convert it with {unit_option(name, unit)}"
@@ -91,7 +95,11 @@ def heading_contradiction(name: str, unit: str, score: float) -> str:
 
 def heading_unit(log: AlignedLog, name: str, given: str = "") -> tuple[str, float]:
     """Return the unit in which a column agrees best with the direction of motion, and how well, in [0, 1]."""
-    scores = heading_scores(log, name, given)
+    return _clear(heading_scores(log, name, given))
+
+
+def _clear(scores: Mapping[str, float]) -> tuple[str, float]:
+    """Return the unit with the best score, and its score. The unit is rad, unless another one is clearly better."""
     best = max(scores, key=lambda unit: scores[unit])
     clear = scores[best] > SAME_CORRELATION and scores[best] > scores["rad"] + 0.1
     return (best, scores[best]) if clear else ("rad", scores["rad"])
@@ -106,15 +114,38 @@ def heading_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, flo
     direction, middle = directions_of_motion(log)
     if not len(middle):
         return dict.fromkeys(HEADING_UNITS, 0.0)
+    return {
+        unit: float(np.abs(np.cos(direction - angles[middle])).mean()) if np.ptp(angles) > LEAST_TURN else 0.0
+        for unit, angles in _readings(log, name, given).items()
+    }
+
+
+def speed_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, float]:
+    """Return for each unit how well speeds in the log agree with the motion along and across a heading in this unit.
+
+    An omnidirectional robot moves in every direction, so only its speeds show the unit of its heading. The score is the
+    largest correlation of another column with one of the two speeds. Speeds along x and y do not count.
+    """
+    along_axes = speeds_of_motion(log, "")
+    others = [
+        other
+        for other in log.columns
+        if other not in (*log.positions, name) and speed_fit(log, other, along_axes, other in log.inputs) is None
+    ]
     scores = {}
+    for unit, angles in _readings(log, name, given).items():
+        speeds = _along_and_across(log, angles) if np.ptp(angles) > LEAST_TURN else []
+        fits = (best_fit(log, other, speeds, other in log.inputs) for other in others)
+        scores[unit] = max((fit.correlation for fit in fits), default=0.0)
+    return scores
+
+
+def _readings(log: AlignedLog, name: str, given: str) -> dict[str, Array]:
+    """Return a heading [rad] for each unit that its column may have, and without the conversion from `given`."""
     readings = {unit: in_si(log.columns[name], unit, "rad") for unit in HEADING_UNITS}
     if given:
         readings[UNCONVERTED] = from_si(log.columns[name], given, "rad")
-    for unit, angles in readings.items():
-        assert angles is not None
-        turned = np.ptp(angles) > 0.5
-        scores[unit] = float(np.abs(np.cos(direction - angles[middle])).mean()) if turned else 0.0
-    return scores
+    return {unit: angles for unit, angles in readings.items() if angles is not None}
 
 
 def directions_of_motion(log: AlignedLog) -> tuple[Array, Indices]:
@@ -138,12 +169,20 @@ def speeds_of_motion(log: AlignedLog, heading: str) -> list[tuple[str, Array]]:
     if not heading:
         return [("m/s", speed) for speed in axes]
     angles = np.unwrap(log.columns[heading])
-    cos, sin = np.cos(angles[(i + j) // 2]), np.sin(angles[(i + j) // 2])
-    x, y = axes[:2]
     return [
-        *(("m/s", cos * x + sin * y), ("m/s", cos * y - sin * x), ("m/s", np.hypot(x, y))),
+        *_along_and_across(log, angles),
+        ("m/s", np.hypot(*axes[:2])),
         ("rad/s", (angles[j] - angles[i]) / time),
     ]
+
+
+def _along_and_across(log: AlignedLog, angles: Array) -> list[tuple[str, Array]]:
+    """Return the speeds of all spans along and across a heading (rows,) [rad], with their units."""
+    i, j = log.spans(SPAN)
+    time = log.time[j] - log.time[i]
+    x, y = (log.change(p, i, j) / time for p in log.positions[:2])
+    cos, sin = np.cos(angles[(i + j) // 2]), np.sin(angles[(i + j) // 2])
+    return [("m/s", cos * x + sin * y), ("m/s", cos * y - sin * x)]
 
 
 def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool) -> SpeedFit | None:

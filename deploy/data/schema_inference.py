@@ -27,8 +27,7 @@ from brakeline.deploy.data.message_columns import FIELDS
 from brakeline.deploy.data.message_columns import HEADING as HEADING_NAME
 from brakeline.deploy.data.motion_check import (
     SAME_CORRELATION,
-    UNCONVERTED,
-    heading_contradiction,
+    heading_problem,
     heading_unit,
     likely_unit,
     needless_conversion,
@@ -353,17 +352,14 @@ def _find_heading(log: AlignedLog, options: LogOptions) -> list[str]:
     candidates = [n for n in log.columns if n not in (*log.positions, *log.inputs)]
     fits = {name: heading_unit(log, name, options.units.get(name, "")) for name in candidates}
     best = max(fits, key=lambda name: fits[name][1], default="")
-    if best and fits[best][1] > SAME_CORRELATION:
-        unit, score = fits[best]
-        if unit == UNCONVERTED:
-            raise NoSource(needless_conversion(best, options.units[best], "rad"))
-        if unit != "rad":
-            raise NoSource(heading_contradiction(best, unit, score))
-        log.set_heading(best)
-        return []
-    if named := [n for n in candidates if HEADING.fullmatch(n.strip())]:
+    confirmed = best != "" and fits[best][1] > SAME_CORRELATION
+    named = [best] if confirmed else [n for n in candidates if HEADING.fullmatch(n.strip())]
+    if named:
+        if problem := heading_problem(log, named[0], options.units):
+            raise NoSource(problem)
         log.set_heading(named[0])
-        return [f"{named[0]} is taken as the heading by its name: the motion does not confirm it"]
+        note = f"{named[0]} is taken as the heading by its name: the motion does not confirm it"
+        return [] if confirmed else [note]
     return ["no column is clearly the heading: none agrees with the motion, and none is named heading or yaw"]
 
 

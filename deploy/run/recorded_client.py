@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from brakeline.errors import BadRequest, BusError
 from brakeline.extras import missing_extra
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.body_clearance import body_clearance
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.message_checks import MAX_VALUE, NAME
@@ -237,8 +238,7 @@ class RecordedClient:
         self._take_unmeasured(step)
         step.state.extend(state.tolist())
         step.header.time = time
-        distances = self._near.distance(state[: self.robot.position_dim])
-        step.clearance = step.closest = float(distances.min(initial=np.inf)) - self.robot.footprint
+        step.clearance = step.closest = float(body_clearance(self.robot, self._near, state))
         self._complete = step
 
     def _end_episode(self, goal: bool = False, collision: bool = False) -> None:

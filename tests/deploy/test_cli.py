@@ -28,6 +28,7 @@ from brakeline.logs.run_groups import METHOD_COLORS
 from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.stated_share import percent
 from brakeline.safety import methods
@@ -370,6 +371,18 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
     status, out, _ = command("robot", "check", path, "--json")
     assert status == 1
     assert {"plan.brakes", "plan.brake", "state.speed.unit"} <= {field for field, _ in json.loads(out)["problems"]}
+
+
+def test_check_names_an_arena_without_room_and_what_to_change(command, tmp_path):
+    """It found no mistake, and `train` gave up minutes later."""
+    path = tmp_path / "rover.toml"
+    path.write_text((ROBOTS_FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "rover"'))
+    task = (ROBOTS_FOLDER / "ground.task.toml").read_text()
+    path.with_name("rover.task.toml").write_text(task)
+    assert command("robot", "check", path)[0] == 0
+    path.with_name("rover.task.toml").write_text(re.sub(r"path_clearance = .*", "path_clearance = 3.0", task, count=1))
+    status, _, err = command("robot", "check", path)
+    assert status == 1 and "arenas.default: none of 1000" in err and "path_clearance (3 m)" in " ".join(err.split())
 
 
 @pytest.mark.parametrize("robot", ["ground", "quadrotor"])

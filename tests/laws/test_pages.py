@@ -202,6 +202,13 @@ def test_every_command_of_the_pages_can_be_parsed(page: Path) -> None:
             parsed.check_options()
 
 
+def test_every_command_that_a_new_description_names_can_be_parsed() -> None:
+    named = re.findall(r"`brakeline ([^`\n]+)`", (ROOT / "robots" / "template.txt").read_text())
+    assert len(named) > 1
+    for name, *words in map(shlex.split, named):
+        parse(name, words)
+
+
 def test_every_public_name_is_in_the_reference() -> None:
     page = (ROOT / "docs" / "api.md").read_text()
     shown = re.findall(r"^::: brakeline\.(\w+)$", page, re.MULTILINE)

@@ -1,6 +1,7 @@
 """Columns that have the right unit and still describe something else: `import` refuses them, and says what to do."""
 
 import math
+import tomllib
 
 import numpy as np
 import pytest
@@ -131,6 +132,45 @@ def test_a_measured_angle_is_in_the_unit_of_the_input_that_it_follows(steered, t
     path = write_csv(tmp_path / "drive.csv", time, values, ("x", "y", "heading", "v", "angle", "speed", "steering"))
     status, text = imported(path, capsys, *(["--unit", unit] if unit else []), robot=robot)
     assert (status == 0, said in text) == (not said, True), text
+
+
+def omnidirectional_log(path, turned=1.0, along_axes=False):
+    """Write the log of a robot that drives in every direction while it turns. turned: the unit of its heading."""
+    rng, rows, pose, speeds, given = np.random.default_rng(0), [], np.zeros(3), np.zeros(3), np.zeros(3)
+    for k in range(2400):
+        if k % 2 == 0 and rng.random() < 0.1:
+            given = rng.uniform([-0.8, -0.6, -0.3], [0.8, 0.6, 1.2]) * (rng.random() > 0.2)
+        rotation = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
+        linear, heading = (speeds[:2], pose[2]) if along_axes else (rotation @ speeds[:2], wrap(pose[2]))
+        seen = [*pose[:2], turned * heading, *speeds]
+        rows.append([*(np.array(seen) + rng.uniform(-0.003, 0.003, 6)), *given])
+        pose, speeds = pose + 0.05 * np.array([*linear, speeds[2]]), speeds + 0.3 * (given - speeds)
+    names = ("x", "y", "heading", "ahead", "aside", "turn", "cmd_ahead", "cmd_aside", "cmd_turn")
+    return write_csv(path, 0.05 * np.arange(2400), np.array(rows), names)
+
+
+def test_the_speeds_of_an_omnidirectional_robot_show_that_its_heading_is_in_degrees(tmp_path, capsys):
+    """Its direction of motion does not, and both commands blamed other columns, or took degrees for rad."""
+    right, wrong = omnidirectional_log(tmp_path / "rad.csv"), omnidirectional_log(tmp_path / "deg.csv", 180.0 / math.pi)
+    file, said = tmp_path / "omni.toml", "heading looks like degrees"
+    assert main(["robot", "new", str(file), "--from", str(wrong)]) == 1
+    assert said in capsys.readouterr().err and not file.exists()
+    assert main(["robot", "new", str(file), "--from", str(right)]) == 0
+    assert main(["robot", "new", str(tmp_path / "same.toml"), "--from", str(wrong), "--unit", "heading=deg"]) == 0
+    assert tomllib.loads((tmp_path / "same.toml").read_text())["state"]["ahead"]["unit"] == "m/s"
+    status, text = imported(wrong, capsys, robot=file)
+    assert status == 1 and said in text
+    status, text = imported(right, capsys, robot=file)
+    assert status == 0, text
+    status, text = imported(right, capsys, "--unit", "heading=deg", robot=file)
+    assert status == 1 and "heading is in rad already" in text
+
+
+def test_speeds_along_x_and_y_show_no_unit_of_the_heading(tmp_path, capsys):
+    """A heading in rad that counts its turns changes slowly if it is read in degrees, and would fit them better."""
+    log = omnidirectional_log(tmp_path / "world.csv", along_axes=True)
+    assert main(["robot", "new", str(tmp_path / "omni.toml"), "--from", str(log)]) == 0
+    assert "looks like" not in capsys.readouterr().out
 
 
 def test_late_inputs_are_imported_with_the_delay_that_the_error_names(driven, tmp_path, capsys):

@@ -1,6 +1,7 @@
 """The log of a program of one's own: every request and step is in it, and it says how the robot followed its sets."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from brakeline.logs.reader import open_log
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.robot import Disc, Robot
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym import SafetyWrapper
@@ -84,6 +86,24 @@ def test_the_log_has_every_request_and_the_step_to_the_next_one(method, tmp_path
     assert min(s.closest for s in first) == pytest.approx(nearest)
     again = figures("replay", safety.path)
     assert (again["requests"], again["identical"] + again["equal"]) == (2 * PERIODS, 2 * PERIODS)
+
+
+def test_the_clearance_is_that_of_the_turned_body(method, tmp_path, figures) -> None:
+    """Not that of the circle about the position that contains it: a long robot passes where the circle does not."""
+
+    class Long(InProcess):
+        @property
+        def robot(self) -> Robot:
+            return replace(super().robot, body=(Disc((0.2, 0.0), 0.1), Disc((-0.2, 0.0), 0.1)))
+
+    beside = [Obstacle("wall", (0.0, 0.25), yaw=-np.pi / 2)]
+    with RecordedClient(Long(method), tmp_path / "mine") as safety:
+        for heading in (0.0, 0.0, 0.1):
+            safety.decide([0.0, 0.0, heading, 0.0, 0.0], [0.0, 0.0], beside)
+    straight, turned = messages(safety.path, "step")
+    assert straight.clearance == pytest.approx(0.15)
+    assert turned.closest == pytest.approx(0.15 - 0.2 * np.sin(0.1))
+    assert figures("analyse", safety.path)["closest_approach"] == pytest.approx(turned.closest)
 
 
 def test_no_stated_collision_is_lost(method, tmp_path, figures) -> None:
