@@ -153,7 +153,8 @@ class Ros2Command:
             return query_service(bus, requests, deadline)
 
         keys = self.keys or options.default_keys()
-        name = distinct_name(self.client) if keys else self.name
+        # Several robots may have nodes with the default name, each in a namespace of its own.
+        name = distinct_name(self.client) if keys or self.name == Ros2Command.name else self.name
         with Bus(BusSettings(connect=self.connect, keys=keys), name) as bus:
             yield ask_service
 

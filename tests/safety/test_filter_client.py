@@ -6,6 +6,7 @@ from inspect import signature
 import numpy as np
 import pytest
 
+from brakeline.deploy.commands.ros2_command import Ros2Command
 from brakeline.errors import BadRequest, NoReply, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.identity import certified_name, identity_of
@@ -317,6 +318,15 @@ def test_clients_with_the_default_name_get_their_own_turns_at_the_service(join, 
     assert len(set(map(identity_of, sources))) == 2 and set(map(certified_name, sources)) == {"client"}
     with SafetyClient.open(endpoint, "ground", name="robot-7") as named:
         assert named.bus.source == "robot-7"
+
+
+def test_ros_nodes_with_the_default_name_get_their_own_turns_too(join, endpoint, model):  # noqa: F811
+    askers, service = [], Service(model)
+    join("safety", listen=True).serve(DECIDE, lambda payload, asker: askers.append(asker) or service.answer(payload))
+    for node in ({}, {}, {"name": "mine"}):
+        with Ros2Command(connect=(endpoint,), **node)._asker(GROUND, lead=30.0) as ask:
+            ask([pb.Request(robot="ground")])
+    assert len(set(map(identity_of, askers))) == 3 and askers[2] == "mine"
 
 
 def test_a_malformed_fleet_is_refused(fleet):
