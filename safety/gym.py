@@ -155,7 +155,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 "another environment uses this client, which has the backup plan of one robot: make one for each"
             )
         before = self.backup_plan.next_input
-        proposed = np.asarray(self._actions.action_to_control(action), dtype=float)
+        proposed = np.array(self._actions.action_to_control(action), dtype=float)  # `action` may be overwritten
         answer, reason = self._decide(proposed)
         executed, self._plan = self.backup_plan.next_input, self.backup_plan.plan
         safe_action = action_for(executed, self._actions, self.env.action_space)

@@ -75,7 +75,8 @@ class BatchSafetyWrapper(VectorWrapper):
         self._deciding: tuple[Array, Array, BatchOutcome] | None = None
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        which = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        mask = (options or {}).get("reset_mask")
+        which = np.ones(self.num_envs, dtype=bool) if mask is None else np.array(mask, dtype=bool)
         # Some environments take the mask out of the options that they get.
         options = None if options is None else dict(options)
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -97,7 +98,12 @@ class BatchSafetyWrapper(VectorWrapper):
         """Decide on the actions (N, m), and start the period in a thread of the environment."""
         if self._infos is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
-        proposed, before = np.asarray(actions, dtype=float), self.plans.input_in_force
+        if self._deciding is not None:
+            raise gymnasium.error.AlreadyPendingCallError("a period is under way: call end_step first", "begin_step")
+        proposed, before = (
+            np.array(actions, dtype=float),
+            self.plans.input_in_force,
+        )  # `actions` may be overwritten
         check_rows(proposed, self.num_envs, self.plans.robot)
         obstacles = ObstacleArrays(**self._infos["obstacles"])
         outcome = self.plans.decide(self._infos["state"], proposed, obstacles, self._observations)
@@ -108,7 +114,7 @@ class BatchSafetyWrapper(VectorWrapper):
     def end_step(self) -> StepBatch:
         """Wait for the period that `begin_step` started, and return what `step` returns."""
         assert self._deciding is not None, "begin_step comes first"
-        proposed, before, outcome = self._deciding
+        (proposed, before, outcome), self._deciding = self._deciding, None
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.end_step()  # type: ignore[attr-defined]
         # In the mode NEXT_STEP, an environment that has ended is reset and takes no action.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)

@@ -88,7 +88,7 @@ class VectorSafetyWrapper(VectorWrapper):
         if self._now is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
         robot = self.client.robot
-        proposed = np.asarray(self._actions.action_to_control(actions), dtype=float)
+        proposed = np.array(self._actions.action_to_control(actions), dtype=float)  # `actions` may be overwritten
         check_rows(proposed, self.num_envs, robot)
         # In the mode NEXT_STEP, an environment that has ended is reset and takes no action.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)

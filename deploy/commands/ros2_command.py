@@ -144,6 +144,7 @@ class Ros2Command:
             yield in_process(model_for(robot, self.filtering.model_config(), accept_bound), accept_bound)
             return
         from brakeline.messaging.bus import Bus, BusSettings
+        from brakeline.messaging.bus.identity import distinct_name
         from brakeline.safety.service.client import query_service
 
         deadline = 0.3 * lead  # a period may need three requests
@@ -152,7 +153,9 @@ class Ros2Command:
             return query_service(bus, requests, deadline)
 
         keys = self.keys or options.default_keys()
-        with Bus(BusSettings(connect=self.connect, keys=keys), self.client if keys else self.name) as bus:
+        # Several robots may have nodes with the default name, each in a namespace of its own.
+        name = distinct_name(self.client) if keys or self.name == Ros2Command.name else self.name
+        with Bus(BusSettings(connect=self.connect, keys=keys), name) as bus:
             yield ask_service
 
 

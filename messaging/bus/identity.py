@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from pathlib import Path
 
 from brakeline.errors import BadKeys
@@ -39,6 +40,14 @@ def role_on_certificate(name: str) -> str:
 def certified_name(source: str) -> str:
     """Return the name on the certificate of a process: one certificate serves NAME and all NAME.MORE."""
     return source.split(".", 1)[0]
+
+
+def distinct_name(name: str) -> str:
+    """Return a name of its own for a process that may share the name of a role with others; other names stay.
+
+    Otherwise, a service would take the processes for one: it answers the askers in turn, and keeps few queries of each.
+    """
+    return f"{name}.{secrets.token_hex(4)}" if name in ROLES else name
 
 
 def identity_of(source: str) -> str:

@@ -100,9 +100,10 @@ class RecoverySearch:
         slow = [inputs.limited(np.clip(u, -most, most), self.before) for u in slow_inputs(robot)]
         plans = [inputs.regressors(self.z_0, action) for action in slow]
         violated = standing + (np.array(plans) - stand) @ rows.gradient.T
-        violated[[self._comes_upon_another(z) for z in plans]] = np.inf
         others = 0 if (near := self.local_map.other_reservations) is None else len(near)
-        best = least_violating(violated, standing, ends_of_plan(robot, planes, len(rows.bound), others))
+        ends = ends_of_plan(robot, planes, len(rows.bound), others)
+        while (best := least_violating(violated, standing, ends)) is not None and self._comes_upon_another(plans[best]):
+            violated[best] = np.inf
         return None if best is None else plans[best]
 
     def _turn(self, rows: ConstraintRows, planes: list[Planes], stand: Array, standing: Array) -> Array | None:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from brakeline.errors import BadRequest, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.bus.identity import distinct_name
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Array, Robot, robot_named
@@ -234,7 +235,7 @@ def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> 
         BadKeys: the folder has no keys of that name.
     """
     endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-    return Bus(BusSettings(connect=endpoints, keys=None if keys is None else Path(keys)), name)
+    return Bus(BusSettings(connect=endpoints, keys=None if keys is None else Path(keys)), distinct_name(name))
 
 
 class BusClient:
@@ -316,7 +317,8 @@ class SafetyClient(BusClient):
             robot: the robot, its name, or the path of its description.
             deadline: longest wait for a decision [s].
             keys: the folder with the keys of `name`, on a bus with keys.
-            name: of this client on the bus.
+            name: of this client on the bus. Only `client` may be the name of several; a service keeps at most 8 waiting
+                queries of one name.
             acceleration_age: your states hold the horizontal acceleration of this long ago [s].
 
         Raises:

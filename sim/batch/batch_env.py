@@ -135,8 +135,9 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         Raises:
             ValueError: there is no such option, or not a seed or flag for each robot.
             gymnasium.error.ClosedEnvironmentError: the threads have ended.
+            gymnasium.error.AlreadyPendingCallError: a period is under way.
         """
-        self._check_open()
+        self._check_idle("reset")
         options = options or {}
         check_options(options, "episode_seeds", "reset_mask")
         rows = self._rows_of(options.get("reset_mask"))
@@ -158,9 +159,11 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             'episodes by reset(options={"episode_seeds": infos["episode_seed"]}) and their actions'
         )
 
-    def _check_open(self) -> None:
+    def _check_idle(self, call: str) -> None:
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("this environment is closed: make another one")
+        if self._stepping is not None:
+            raise gymnasium.error.AlreadyPendingCallError("a period is under way: call end_step first", call)
 
     def _rows_of(self, mask: Any) -> NDArray[np.intp]:
         """Return the robots of a mask (N,), or all of them without one; the first reset is of all."""
@@ -192,8 +195,9 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             BadInput: an input is not finite.
             gymnasium.error.ResetNeeded: no episode has begun.
             gymnasium.error.ClosedEnvironmentError: the threads have ended.
+            gymnasium.error.AlreadyPendingCallError: a period is under way.
         """
-        self._check_open()
+        self._check_idle("begin_step")
         if self._now is None:
             raise gymnasium.error.ResetNeeded("call reset() before the first step")
         inputs = np.asarray(actions, dtype=float)

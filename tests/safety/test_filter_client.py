@@ -6,8 +6,10 @@ from inspect import signature
 import numpy as np
 import pytest
 
+from brakeline.deploy.commands.ros2_command import Ros2Command
 from brakeline.errors import BadRequest, NoReply, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus.identity import certified_name, identity_of
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
@@ -306,6 +308,25 @@ def test_a_fleet_needs_an_entry_for_each_robot_and_the_error_names_what_lacks_on
     given = {"states": [np.zeros(5)] * 2, "actions": [np.zeros(2)] * 2, "obstacles": [[], []], "scans": [None, None]}
     with pytest.raises(ValueError, match=f"{name} has 3 entries: give one for each of {', '.join(NAMES)}"):
         fleet.decide(**(given | {name: given[name] + given[name][:1]}), known_free=True)
+
+
+def test_clients_with_the_default_name_get_their_own_turns_at_the_service(join, endpoint):  # noqa: F811
+    """Two dozen robots under one name would lose half of their queries: a service keeps 8 of each name."""
+    join("safety", listen=True)
+    with SafetyClient.open(endpoint, "ground") as one, FleetClient.open(endpoint, "ground", NAMES) as other:
+        sources = one.bus.source, other.bus.source
+    assert len(set(map(identity_of, sources))) == 2 and set(map(certified_name, sources)) == {"client"}
+    with SafetyClient.open(endpoint, "ground", name="robot-7") as named:
+        assert named.bus.source == "robot-7"
+
+
+def test_ros_nodes_with_the_default_name_get_their_own_turns_too(join, endpoint, model):  # noqa: F811
+    askers, service = [], Service(model)
+    join("safety", listen=True).serve(DECIDE, lambda payload, asker: askers.append(asker) or service.answer(payload))
+    for node in ({}, {}, {"name": "mine"}):
+        with Ros2Command(connect=(endpoint,), **node)._asker(GROUND, lead=30.0) as ask:
+            ask([pb.Request(robot="ground")])
+    assert len(set(map(identity_of, askers))) == 3 and askers[2] == "mine"
 
 
 def test_a_malformed_fleet_is_refused(fleet):

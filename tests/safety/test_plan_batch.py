@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import AlreadyPendingCallError
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
@@ -212,6 +213,31 @@ def test_an_environment_that_overwrites_its_inputs_changes_no_figure() -> None:
     infos["state"][:] = 3.0
     *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
     assert infos["outcome"].answers.contained.all(), "a policy that overwrites a state changes no request"
+    env.close()
+
+
+@pytest.mark.parametrize("options", [None, {}, {"reset_mask": None}, {"reset_mask": np.ones(2, dtype=bool)}])
+def test_a_reset_of_all_robots_begins_all_plans_anew(options: Any) -> None:
+    env = BatchSafetyWrapper(BatchNavigationEnv(GROUND, 2, "open"), SAFETY)
+    env.reset(seed=0)
+    env.step(np.tile([0.2, 0.0], (2, 1)))
+    env.reset(seed=1, options=options)
+    assert not env.plans.input_in_force.any() and not env.plans.predicted.given.any()
+    env.close()
+
+
+def test_a_period_under_way_ends_before_the_next_call() -> None:
+    env = BatchSafetyWrapper(BatchNavigationEnv(GROUND, 2, "open"), SAFETY, penalty=1.0)
+    env.reset(seed=0)
+    actions = np.tile([0.25, 0.0], (2, 1))
+    env.begin_step(actions)
+    actions[:] = 0.0
+    for call in (lambda: env.begin_step(actions), env.reset, lambda: env.env.begin_step(actions)):  # type: ignore[attr-defined]
+        with pytest.raises(AlreadyPendingCallError, match="call end_step first"):
+            call()
+    *_, infos = env.end_step()
+    assert infos["executed"][:, 0].tolist() == [0.25, 0.25] and not infos["penalty"].any(), "of the actions of then"
+    assert infos["contained"].all() and infos["time"].tolist() == [0.2, 0.2]
     env.close()
 
 
