@@ -76,7 +76,7 @@ def _sources() -> str:
     """Return a digest of all kernels, and of the modules of ours that they import: their constants are compiled in."""
     here, digest = Path(__file__).parent, hashlib.sha256()
     kernels = {path for part in PARTS for path in (here / part).rglob("kernels/*.py")}
-    imports = {name for path in kernels for name in IMPORTED.findall(path.read_text())}
+    imports = {name for path in kernels for name in IMPORTED.findall(path.read_text("utf-8"))}
     imported = {here.joinpath(*name.split(".")).with_suffix(".py") for name in imports}
     for path in sorted(kernels | {path for path in imported if path.exists()}):
         digest.update(str(path.relative_to(here)).encode() + b"\0" + path.read_bytes() + b"\0")

@@ -9,6 +9,7 @@ make sense (`check_option_numbers`). A command imports what an extra brings in `
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import errno
 import importlib
@@ -19,6 +20,7 @@ from contextlib import nullcontext
 from copy import copy
 from dataclasses import fields, is_dataclass, make_dataclass, replace
 from importlib.metadata import version
+from io import TextIOWrapper
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
@@ -257,6 +259,8 @@ def main(arguments: list[str] | None = None) -> int:
     0: done. 1: the command failed; stderr has the reason. 2: the command line can't be parsed. 130: the user
     interrupted the command; 143 and 129: SIGTERM or SIGHUP did. A command may have further ones.
     """
+    if isinstance(sys.stdout, TextIOWrapper) and codecs.lookup(sys.stdout.encoding).name != "utf-8":
+        sys.stdout.reconfigure(errors="replace")  # a locale without a letter such as ≤ must not end a command
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes with two threads each on two cores are slower
     words = sys.argv[1:] if arguments is None else arguments
     errors = Console(stderr=True, highlight=False)

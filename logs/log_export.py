@@ -21,6 +21,7 @@ from brakeline.logs.reader import Log, Record
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import whole_or_nothing
+from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
 
 BATCH = 1000  # messages per write
@@ -30,7 +31,7 @@ INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weig
 TIME = struct.Struct(">Q")  # of a frame in a .tlog file: µs since the Unix epoch
 
 
-def robot_steps(log: Log, robot: RobotWithTask) -> Iterator[Record]:
+def robot_steps(log: Log, robot: Robot) -> Iterator[Record]:
     """Yield the steps of a robot kind in the order of receipt.
 
     Raises:
@@ -52,15 +53,16 @@ def robot_steps(log: Log, robot: RobotWithTask) -> Iterator[Record]:
         raise ExportError(f"the log has no step of {robot.name} or of any other robot")
 
 
-def to_csv(log: Log, robot: RobotWithTask, file: TextIO) -> int:
+def to_csv(log: Log, robot: Robot, file: TextIO) -> int:
     """Write each step of a robot kind as a line, and return the number of steps. Raises as `robot_steps`.
 
     Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, and the fields of the message
-    but `path`; vectors as `field.name [unit]`, the decision by its name.
+    but `path`; vectors as `field.name [unit]`, the decision by its name. A robot without a task has no observations.
     """
+    observed = robot.task.observed if isinstance(robot, RobotWithTask) else ()
     vectors = {
-        **{"observation": robot.task.observed, "proposed": robot.action, "action": robot.action},
-        **{"next_observation": robot.task.observed, "state": robot.state, "true_state": robot.state},
+        **{"observation": observed, "proposed": robot.action, "action": robot.action},
+        **{"next_observation": observed, "state": robot.state, "true_state": robot.state},
     }
     plain = [f.name for f in pb.Step.DESCRIPTOR.fields if not f.is_repeated and f.message_type is None]
     header = ["time", "source", "run", "sequence"]

@@ -23,7 +23,7 @@ from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 from brakeline.sim.weak_motor import WeakMotor
 
 GROUND = robot_named("ground")
-MODEL = Path(__file__).with_name("ground.xml").read_text()
+MODEL = Path(__file__).with_name("ground.xml").read_text("utf-8")
 WHEEL_RADIUS = 0.033  # m
 TRACK = 0.160  # m between the wheels
 COORDINATES, SPEEDS = 9, 8  # of one robot in a model: a free body and two wheels

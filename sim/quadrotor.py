@@ -25,7 +25,7 @@ from brakeline.sim.weak_motor import WeakMotor
 from brakeline.sim.wind import Wind, WindProcess
 
 QUADROTOR = robot_named("quadrotor")
-MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
+MODEL = Path(__file__).with_name("quadrotor.xml").read_text("utf-8")
 SAMPLES = 5  # of the position in a period
 FLOOR_BIT = 1
 STANDING = 0.15  # m/s; below this speed, and at the setpoint zero, it hovers in place

@@ -79,6 +79,7 @@ class CertifyCommand:
         path, data, note = self._load()
         accepted_bound(data.robot, self.accept_bound)
         forms = self._forms(data.robot)
+        self._refuse_unused(forms)
         if self.until_held and (RESIDUAL, ONE_STEP) in forms:
             raise ValueError(
                 "--until-held is for --mode direct and recursion; in mode one-step, a smaller --outside widens the sets"
@@ -148,6 +149,17 @@ class CertifyCommand:
                 )
             return [(RESIDUAL, mode)]
         return list(product(self.certificates or KINDS, (mode,) if mode else MODES))
+
+    def _refuse_unused(self, forms: list[tuple[str, str]]) -> None:
+        """Raise ValueError for an option that does nothing in these forms, or with these data."""
+        one_step, log = (RESIDUAL, ONE_STEP) in forms, self.data is not None and self.data.suffix != DATA[0]
+        unused = {
+            "--windows is for --mode direct and recursion": one_step and self.windows != CertifyCommand.windows,
+            "--outside is for mode one-step": not one_step and self.outside != CertifyCommand.outside,
+            "--last is for logs": not log and self.last != CertifyCommand.last,
+        }
+        if reasons := [reason for reason, is_unused in unused.items() if is_unused]:
+            raise ValueError(f"{'; '.join(reasons)}: leave that out")
 
     def _put_to_use(self, model: ModelSet, data: Dataset) -> dict[str, str]:
         """Save the model set if you give --use, and return its path; or return and print why it may not be used."""

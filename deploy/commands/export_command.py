@@ -11,7 +11,7 @@ from brakeline.deploy.commands.command_output import print_damage, print_result
 from brakeline.deploy.commands.common_options import LATEST, Json, Logs, Quiet
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.atomic_files import whole_or_nothing
-from brakeline.messaging.task import robot_with_task
+from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
 if TYPE_CHECKING:
     from brakeline.logs.reader import Log
@@ -64,7 +64,7 @@ class ExportCommand:
     def _csv(self, log: Log, out: Path) -> dict[str, Any]:
         from brakeline.logs.log_export import to_csv
 
-        robot = robot_with_task(self.robot)
+        robot = robot_maybe_with_task(self.robot)
         with whole_or_nothing(out) as path, path.open("w", newline="") as file:
             return {"path": str(out), "steps": to_csv(log, robot, file)}
 

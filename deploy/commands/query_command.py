@@ -157,7 +157,7 @@ def load_scan(path: Path, dim: int) -> RangeMeasurement:
     kind = Scan if dim == 2 else RangeImage
     names = [field.name for field in fields(kind) if field.name != "followed"]
     try:
-        values = parse_json(path.read_text())
+        values = parse_json(path.read_text("utf-8-sig"))
         if not isinstance(values, dict) or not values.keys() <= set(names):
             raise BadScan(f"{path}: not a {kind.__name__}, which is a JSON object of {', '.join(names)}")
         return kind(**values)

@@ -64,12 +64,12 @@ class RobotCommand:
             raise ValueError(
                 f"{path} exists: check it with `brakeline robot check {path}`, delete it, or choose another name"
             )
-        text = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
+        text = (ROBOTS_FOLDER / "template.txt").read_text("utf-8").replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
         options = self.reading.options(self.map)
         if self.from_:
             text, notes = _from_logs(self.from_, text, path.stem, options)
-        path.write_text(text)
+        path.write_bytes(text.encode())  # TOML is UTF-8 in any locale
         following = f"{path}: fill it in, then `brakeline robot check {path}`"
         if words := options.words():
             logs = shlex.join(map(str, self.from_))

@@ -22,8 +22,8 @@ from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT, ONE_STEP, Mo
 
 
 def data_root() -> Path:
-    """Return `$BRAKELINE_DATA`, or `data` in the working directory if it is not set."""
-    return Path(os.environ.get("BRAKELINE_DATA", "data"))
+    """Return `$BRAKELINE_DATA`, or `data` in the working directory if it is not set or empty."""
+    return Path(os.environ.get("BRAKELINE_DATA") or "data")
 
 
 def record_path(robot: Robot) -> Path:

@@ -18,10 +18,12 @@ def check_resumable(config: RunConfig, folder: Path) -> None:
         config: of the run that goes on. With other steps than in the folder, it replaces the configuration there.
 
     Raises:
-        LaunchError: a learner has no checkpoint and gets no logs, or it has more steps than are asked for.
+        LaunchError: a learner has no checkpoint and gets no logs, or it has more steps than are asked for. Or it has a
+            checkpoint, and gets logs of another run.
         DamagedPart: the checkpoint is lost in part, and there are no logs.
     """
-    stored = load(folder / CONFIG).steps if (folder / CONFIG).exists() else config.steps
+    stored = load(folder / CONFIG) if (folder / CONFIG).exists() else config
+    others = [name for name in config.from_logs if name not in stored.from_logs and not _within(folder, Path(name))]
     for root in (
         folder / spec.name / checkpoint.CHECKPOINT for spec in process_specs(config) if spec.kind == "learner"
     ):
@@ -33,8 +35,20 @@ def check_resumable(config: RunConfig, folder: Path) -> None:
                     f"--resume {folder} --from-logs {folder}`. Or begin anew in another folder: --out"
                 )
             learned = checkpoint.about_latest(root).get("steps", 0)
-        if config.steps < min(stored, learned):
+        if others and learned:
+            raise LaunchError(
+                f"{folder}: the learner has {learned} steps of its own, and would take steps of {', '.join(others)} "
+                "for those of its own actors, which it has already. With --resume, --from-logs replaces a lost "
+                "checkpoint by the log of the run. To learn from both, begin a new run: `brakeline train --from-logs "
+                f"{folder} {' '.join(others)}`"
+            )
+        if config.steps < min(stored.steps, learned):
             raise LaunchError(
                 f"{folder}: the learner has {learned} steps already, more than --steps {config.steps}. To go on, give "
                 "more --steps; to see what came of it, `brakeline analyse`"
             )
+
+
+def _within(folder: Path, path: Path) -> bool:
+    """Return whether a log is in the run's folder, or is the folder."""
+    return folder.resolve() in (path.resolve(), *path.resolve().parents)

@@ -206,6 +206,19 @@ def test_certify_refuses_data_of_another_robot_than_the_named_one(command, tmp_p
     assert status == 1 and "has data of quadrotor, not of porter: certify quadrotor, or import the log" in err
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--windows free", "--windows is for --mode direct and recursion: leave that out"),
+        ("--mode direct --outside 0.01", "--outside is for mode one-step: leave that out"),
+        ("--mode direct --last 100", "--last is for logs: leave that out"),
+    ],
+)
+def test_certify_refuses_options_that_would_do_nothing(command, few_data, words, said):
+    status, _, err = command("certify", "--data", few_data, *words.split())
+    assert status == 1 and said in " ".join(err.split())
+
+
 def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(
     command, figures, few_data, monkeypatch
 ):

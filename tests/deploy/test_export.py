@@ -13,7 +13,10 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline import Filter, InProcess, RecordedClient
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import robot_named
+from tests.deploy.data.porter import FILE
 from tests.full_disk import full_disk
+from tests.logs.sample_log import written
 from tests.robots import GROUND
 
 STEPS = 150
@@ -44,6 +47,25 @@ def test_csv_has_every_step_with_every_field(log, tmp_path, figures) -> None:
             assert [float(row[f"{name}.{part}"]) for part in parts] == list(getattr(step, name)), name
     missing = {f.name for f in pb.Step.DESCRIPTOR.fields} - {name.split(".")[0] for name in rows[0]}
     assert missing == {"path"}
+
+
+def test_csv_of_a_robot_without_a_task_has_all_but_observations(tmp_path, command) -> None:
+    """A program of your own records a robot that has a description alone."""
+    robot = robot_named(str(FILE))
+    about = {
+        "robot": robot.name,
+        "actor": "a",
+        "proposed": [0.1] * robot.action_dim,
+        "action": [0.2] * robot.action_dim,
+    }
+    steps = [pb.Step(**about, step=i, index=i + 1, state=[0.5 * i] * robot.state_dim) for i in range(3)]
+    written(tmp_path / "run.mcap", ((f"step/{robot.name}/a", step, 1 + i) for i, step in enumerate(steps)))
+    status, _, err = command("export", tmp_path, "--csv", tmp_path / "steps.csv", "--robot", FILE)
+    assert status == 0, err
+    with (tmp_path / "steps.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [[float(row[f"state.{part}"]) for part in robot.state] for row in rows] == [list(s.state) for s in steps]
+    assert not any(name.startswith("observation") for name in rows[0])
 
 
 @pytest.mark.parametrize("words", [("export", "--csv"), ("export", "--tlog"), ("analyse", "--html")])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.data.data_paths import data_root, record_path
 from brakeline.deploy.data.model_store import model_for, put_to_use
 from brakeline.errors import Untrusted
 from brakeline.safety.model.dataset import Dataset
@@ -33,3 +33,9 @@ def test_a_model_set_is_signed_if_there_is_a_key_and_never_beside_the_seal_of_an
     assert put_to_use(other, data, tmp_path / "keys") == path
     assert trust.load_model(path).version == other.version
     assert model_for(GROUND, ModelConfig(mode=AUTO), accept_bound=1.0).version == other.version
+
+
+def test_an_empty_variable_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compose file or a script sets it so. The data would be in the working directory itself."""
+    monkeypatch.setenv("BRAKELINE_DATA", "")
+    assert data_root() == Path("data")

@@ -2,8 +2,11 @@
 
 import io
 import math
+import os
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
@@ -245,6 +248,17 @@ def test_a_unit_that_nobody_knows_is_refused_until_it_is_named(driven, tmp_path,
     for name in ("time [-]", "time [0]"):  # no unit, and the index of a field
         imported(write_cells(tmp_path / "drive.csv", (name, *COLUMNS), np.column_stack([time, values])))
     imported(path, "--unit", "time=s")
+
+
+def test_a_description_is_utf_8_in_any_locale(driven, tmp_path):
+    """It holds the names of the log's columns."""
+    path, new = write_csv(tmp_path / "log.csv", *driven), tmp_path / "new.toml"
+    path.write_text(path.read_text().replace("heading", "heading [°]", 1), encoding="utf-8")
+    words = (sys.executable, "-m", "brakeline.deploy.cli", "robot", "new", str(new), "--from", str(path))
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(words, env=os.environ | ascii_only, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "heading [°]" in new.read_text("utf-8") and robot_named(str(new)).heading is not None
 
 
 def test_the_first_line_for_excel_is_passed_over(driven, plain, tmp_path):

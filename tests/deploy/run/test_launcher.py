@@ -150,6 +150,21 @@ def test_a_resumed_run_keeps_its_configuration_if_it_has_more_steps_than_are_ask
     prepare(replace(config, steps=4000), tmp_path, resume=True)  # ends earlier than planned
 
 
+def test_a_learner_with_a_checkpoint_gets_no_logs_of_another_run(tmp_path: Path) -> None:
+    """Their actors have the names of its own, so that it took their episodes for those that it had."""
+    config, folder = RunConfig(method="none", steps=5000, from_logs=("runs/earlier",)), tmp_path / "run"
+    folder.mkdir()
+    (folder / CONFIG).write_text(encode(config))
+    own = (str(folder), f"{folder}/../run/run.mcap", "runs/earlier")
+    with_other = replace(config, from_logs=(str(folder), "runs/other"))
+    prepare(with_other, folder, resume=True)  # the checkpoint is lost
+    checkpoint.save(folder / "learner" / CHECKPOINT, {}, {"steps": 3000})
+    for logs in ((), own):
+        prepare(replace(config, from_logs=logs), folder, resume=True)
+    with pytest.raises(LaunchError, match=r"3000 steps of its own, and would take steps of runs/other for.* new run"):
+        prepare(with_other, folder, resume=True)
+
+
 def test_a_run_that_is_running_is_not_resumed_and_its_lock_ends_with_its_process(tmp_path: Path) -> None:
     write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
     hold = f"""
