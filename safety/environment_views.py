@@ -26,7 +26,7 @@ def in_info(name: str) -> View:
             names = ", ".join(sorted(map(str, info))) or "nothing"
             raise Mismatch(
                 f"the environment's info has no {name!r} ({CONTENTS[name]}; it has: {names}): "
-                f"give {name}=, a callable (env, observation, info)"
+                f"return it in the info of `reset` and `step`, or give {name}=, a callable (env, observation, info)"
             )
         return info[name]
 

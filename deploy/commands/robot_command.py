@@ -196,6 +196,6 @@ def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: Log
             return text, (*one.notes, NOT_SHOWN)
     reasons = "\n  ".join((*schema.notes, problems))
     raise NoSource(
-        f"{names}: no description without mistakes follows from it. Drive so that every input takes several values and "
-        f"the robot moves and turns, or name columns with --map:\n  {reasons}"
+        f"{names}: no description without mistakes follows from it. Name the columns with --map, or drive so that "
+        f"every input takes several values and the robot moves and turns:\n  {reasons}"
     )

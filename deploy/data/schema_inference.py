@@ -293,8 +293,9 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
     axes |= {axis: axis for axis in AXES if axis in chosen or axis in table.columns}
     if not {"x", "y"} <= axes.keys():
         raise NoSource(
-            f"the position columns `x` and `y` are missing; the columns are: {', '.join(table.columns)}. Name them "
-            "with --map x=COLUMN y=COLUMN"
+            f"the position columns `x` and `y` are missing; the columns are: {', '.join(table.columns)}. Name every "
+            "column of the robot with --map, because the command then reads no others: --map x=COLUMN y=COLUMN "
+            f"heading=COLUMN SPEED=COLUMN '{COMMAND} INPUT=COLUMN' …"
         )
     flat = axes.pop("z") if "z" in axes and "z" not in chosen and _is_flat(table.columns[axes["z"]]) else ""
     notes = (f"left out, as it changes by less than a millimetre: {flat}",) if flat else ()
@@ -303,6 +304,8 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
     names = (
         [*positions, *(n for n in chosen if n not in positions)] if chosen else [n for n in table.columns if n != flat]
     )
+    if unnamed := [c for c in table.columns if chosen and c not in (*names, *chosen.values())]:
+        notes += (f"left out, as --map does not name them: {_listed(unnamed)}",)
     places: Places = {name: (table, chosen.get(name, name)) for name in names}
     places = {name: place for name, place in places.items() if np.isfinite(table.columns[place[1]]).any()}
     known = {name: values[np.isfinite(values)] for name, (t, c) in places.items() for values in (t.columns[c],)}

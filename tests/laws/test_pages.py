@@ -9,6 +9,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import brakeline
@@ -16,6 +17,8 @@ from brakeline import ModelSet
 from brakeline.deploy.cli import parse
 from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.messaging.task import robot_with_task
+from brakeline.sim.arena_generator import draw_arena
 from tests.laws.test_names import PARTS
 
 pytestmark = pytest.mark.fast
@@ -184,6 +187,17 @@ def test_every_message_of_troubleshooting_is_in_the_code() -> None:
 def test_the_tutorial_shows_the_example_as_it_is() -> None:
     page = (ROOT / "docs" / "tutorial_4_policy.md").read_text()
     assert f"```python\n{(ROOT / 'examples' / 'my_policy.py').read_text()}```" in page
+
+
+def test_the_task_of_the_page_is_one_of_an_omnidirectional_robot(tmp_path: Path) -> None:
+    [text] = re.findall(r"```toml\n(simulator.*?)```", (ROOT / "docs" / "your_robot.md").read_text(), re.DOTALL)
+    (tmp_path / "my.toml").write_text((ROOT / "examples" / "omni" / "omni.toml").read_text().replace('"omni"', '"my"'))
+    (tmp_path / "my.task.toml").write_text(text)
+    robot = robot_with_task(tmp_path / "my.toml")
+    arena = draw_arena("default", np.random.default_rng(0), robot)
+    senses = robot.task.code(robot.task.senses)(robot, arena, np.random.default_rng(0), 0.0)
+    state = np.zeros(robot.state_dim)
+    assert senses.observe(state, state, robot.zero_input()).shape == (robot.task.observation_dim,)
 
 
 def commands(page: str) -> list[str]:

@@ -150,12 +150,16 @@ def test_an_input_in_another_unit_than_its_speed_is_noted(tmp_path, driven, caps
     assert "may be in" not in capsys.readouterr().out
 
 
-def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
+def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path, capsys):
     time, values = driven
     with pytest.raises(NoSource, match="the position columns `x` and `y` are missing; the columns are: a, b"):
         infer_schema([table(time, values[:, :2], ("a", "b"))])
+    with pytest.raises(NoSource, match="the command then reads no others: --map x=COLUMN y=COLUMN heading=COLUMN"):
+        infer_schema([table(time, values[:, :2], ("a", "b"))])
     path = write_csv(tmp_path / "a.csv", time, values[:, :5], COLUMNS[:5])
     out = tmp_path / "seen.toml"
+    assert main(["robot", "new", str(out), "--from", str(path), "--map", "x=x", "y=y"]) == 1
+    assert "left out, as --map does not name them: heading, v, w" in " ".join(capsys.readouterr().err.split())
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
     text = out.read_text()
     assert "# no column is clearly an input" in text and "# Inputs cannot be inferred from the log" in text
