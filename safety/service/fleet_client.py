@@ -25,7 +25,7 @@ from brakeline.safety.service.client import (
     read_reply,
     request_message,
 )
-from brakeline.safety.service.filter_client import Answer, accept
+from brakeline.safety.service.filter_client import Answer, accept, obstacle_lists
 from brakeline.safety.service.wire import MAX_REQUESTS
 
 
@@ -112,13 +112,14 @@ class FleetClient(BusClient):
         ):
             if len(values) != len(self.names):
                 raise ValueError(f"{name} has {len(values)} entries: give one for each of {', '.join(self.names)}")
-        robots = zip(self.names, self.backup_plans, states, actions, *local_maps, strict=True)
+        near, seen = obstacle_lists(local_maps[0]), local_maps[1]
+        robots = zip(self.names, self.backup_plans, states, actions, near, seen, strict=True)
         requests = [
             request_message(
                 backup_plan,
                 state,
                 action,
-                near,
+                obstacles_near,
                 scan=scan,
                 known_free=known_free,
                 actor=name,
@@ -126,7 +127,7 @@ class FleetClient(BusClient):
                 step=self._step,
                 fleet=self.names,
             )
-            for name, backup_plan, state, action, near, scan in robots
+            for name, backup_plan, state, action, obstacles_near, scan in robots
         ]
         replies = zip(query_service(self.bus, requests, self.deadline), requests, strict=True)
         answers = [read_reply(reply, request, self.robot) for reply, request in replies]
