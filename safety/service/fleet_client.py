@@ -53,7 +53,7 @@ class FleetClient(BusClient):
 
         Raises:
             ValueError: there are fewer than two names, or more than a service decides on at once, or two are equal, or
-                the robot has no position; or the deadline is not above 0 and at most a day.
+                the robot has no position, or drives in real time; or the deadline is not above 0 and at most a day.
         """
         if isinstance(names, str) or len(names) < 2 or len(set(names)) < len(names):
             raise ValueError(f"a fleet needs two robots or more with different names, not {names!r:.80}")
@@ -62,6 +62,8 @@ class FleetClient(BusClient):
         super().__init__(bus, robot, deadline)
         if not self.robot.position_dim:
             raise ValueError(f"{self.robot.name} has no position, so it reserves no space: use a SafetyClient for each")
+        if self.robot.late:
+            raise ValueError(f"{self.robot.name} gets its decisions too late for reservations: drive it in lockstep")
         self.names = tuple(names)
         self.backup_plans = [BackupPlan(self.robot, acceleration_age=acceleration_age) for _ in self.names]
         self._episode = self._step = 0

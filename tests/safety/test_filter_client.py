@@ -343,6 +343,8 @@ def test_a_malformed_fleet_is_refused(fleet):
     for names in ((), ("alone",), ("same", "same"), "left"):
         with pytest.raises(ValueError, match="two robots or more"):
             FleetClient(fleet.bus, "ground", names)
+    with pytest.raises(ValueError, match="ground-late gets its decisions too late for reservations"):
+        FleetClient(fleet.bus, "ground-late", NAMES)
     with pytest.raises(ValueError, match="at most 64 robots, not 65: a service refuses more"):
         FleetClient(fleet.bus, "ground", [f"robot-{i}" for i in range(65)])
 
