@@ -139,7 +139,7 @@ class Shapes(ComparedByValue):
 
     @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
-        """Stack obstacles.
+        """Stack obstacles as they stand now. A motion is left out: `split_moving` separates obstacles that move.
 
         Raises:
             BadShape: an obstacle has another dimension than `dim`.

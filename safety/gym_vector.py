@@ -21,7 +21,7 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import diagnostics, is_measurement_fault
 from brakeline.safety.gym_checks import age_of_acceleration, check_filter, check_robot, check_rows
 from brakeline.safety.perception.image_memory import filled, memory_of
-from brakeline.safety.service.filter_client import Answer
+from brakeline.safety.service.filter_client import Answer, obstacle_lists
 from brakeline.safety.service.in_process import InProcess, request_observation
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ class VectorSafetyWrapper(VectorWrapper):
             near = [None] * self.num_envs
         if len(near) != self.num_envs:
             raise Mismatch(f"obstacles has {len(near)} lists for {self.num_envs} environments: give a list for each")
-        return states, near
+        return states, obstacle_lists(near)
 
     def _missing_entries(self) -> dict[int, str]:
         """Return the environments whose own info has no state or no obstacles, where Gymnasium puts zeros or None."""

@@ -134,6 +134,20 @@ def obstacles_in(value: Iterable[Obstacle] | None) -> list[Obstacle]:
     return obstacles
 
 
+def obstacle_lists(many: Iterable[Iterable[Obstacle] | None]) -> list[list[Obstacle] | None]:
+    """Return the obstacles near each of many robots as lists. Raises BadRequest for another type.
+
+    An iterator is at its end after its first use, as if all space were free. So each one is read once, also if several
+    robots share it.
+    """
+    read: dict[int, list[Obstacle] | None] = {}
+    kept = list(many)
+    for one in kept:
+        if id(one) not in read:
+            read[id(one)] = None if one is None else obstacles_in(one)
+    return [read[id(one)] for one in kept]
+
+
 def scan_in(value: RangeMeasurement | None) -> RangeMeasurement | None:
     """Return the argument `scan`. Raises BadRequest for another type."""
     if value is not None and not isinstance(value, Scan | RangeImage):

@@ -25,7 +25,7 @@ from brakeline.safety.service.client import (
     read_reply,
     request_message,
 )
-from brakeline.safety.service.filter_client import Answer, accept
+from brakeline.safety.service.filter_client import Answer, accept, obstacle_lists
 from brakeline.safety.service.wire import MAX_REQUESTS
 
 
@@ -53,7 +53,7 @@ class FleetClient(BusClient):
 
         Raises:
             ValueError: there are fewer than two names, or more than a service decides on at once, or two are equal, or
-                the robot has no position; or the deadline is not above 0 and at most a day.
+                the robot has no position, or drives in real time; or the deadline is not above 0 and at most a day.
         """
         if isinstance(names, str) or len(names) < 2 or len(set(names)) < len(names):
             raise ValueError(f"a fleet needs two robots or more with different names, not {names!r:.80}")
@@ -62,6 +62,8 @@ class FleetClient(BusClient):
         super().__init__(bus, robot, deadline)
         if not self.robot.position_dim:
             raise ValueError(f"{self.robot.name} has no position, so it reserves no space: use a SafetyClient for each")
+        if self.robot.late:
+            raise ValueError(f"{self.robot.name} gets its decisions too late for reservations: drive it in lockstep")
         self.names = tuple(names)
         self.backup_plans = [BackupPlan(self.robot, acceleration_age=acceleration_age) for _ in self.names]
         self._episode = self._step = 0
@@ -112,13 +114,14 @@ class FleetClient(BusClient):
         ):
             if len(values) != len(self.names):
                 raise ValueError(f"{name} has {len(values)} entries: give one for each of {', '.join(self.names)}")
-        robots = zip(self.names, self.backup_plans, states, actions, *local_maps, strict=True)
+        near, seen = obstacle_lists(local_maps[0]), local_maps[1]
+        robots = zip(self.names, self.backup_plans, states, actions, near, seen, strict=True)
         requests = [
             request_message(
                 backup_plan,
                 state,
                 action,
-                near,
+                obstacles_near,
                 scan=scan,
                 known_free=known_free,
                 actor=name,
@@ -126,7 +129,7 @@ class FleetClient(BusClient):
                 step=self._step,
                 fleet=self.names,
             )
-            for name, backup_plan, state, action, near, scan in robots
+            for name, backup_plan, state, action, obstacles_near, scan in robots
         ]
         replies = zip(query_service(self.bus, requests, self.deadline), requests, strict=True)
         answers = [read_reply(reply, request, self.robot) for reply, request in replies]

@@ -310,6 +310,16 @@ def test_a_fleet_needs_an_entry_for_each_robot_and_the_error_names_what_lacks_on
         fleet.decide(**(given | {name: given[name] + given[name][:1]}), known_free=True)
 
 
+def test_robots_of_a_fleet_may_share_an_iterator_of_obstacles(fleet):
+    """The second robot would find it empty, as if all space were free."""
+    near = iter([Obstacle("box", (0.25, 0.0), (0.2, 2.0))])
+    robots = facing()
+    decided(fleet, robots, [[0.0, 0.0]] * 2)
+    fleet.reset()
+    answers = fleet.decide([r.measure() for r in robots], [[0.25, 0.0]] * 2, [near, near], known_free=True)
+    assert not answers[1].verified or answers[1].kind == "failsafe"
+
+
 def test_clients_with_the_default_name_get_their_own_turns_at_the_service(join, endpoint):  # noqa: F811
     """Two dozen robots under one name would lose half of their queries: a service keeps 8 of each name."""
     join("safety", listen=True)
@@ -333,6 +343,8 @@ def test_a_malformed_fleet_is_refused(fleet):
     for names in ((), ("alone",), ("same", "same"), "left"):
         with pytest.raises(ValueError, match="two robots or more"):
             FleetClient(fleet.bus, "ground", names)
+    with pytest.raises(ValueError, match="ground-late gets its decisions too late for reservations"):
+        FleetClient(fleet.bus, "ground-late", NAMES)
     with pytest.raises(ValueError, match="at most 64 robots, not 65: a service refuses more"):
         FleetClient(fleet.bus, "ground", [f"robot-{i}" for i in range(65)])
 

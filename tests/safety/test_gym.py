@@ -376,6 +376,26 @@ def test_a_vector_brakes_the_robot_alone_whose_state_or_obstacles_are_missing(re
             assert (env.backup_plans[1].input_in_force < env.backup_plans[0].input_in_force)[0], "it brakes"
 
 
+WITHIN = Obstacle("box", (0.0, 0.0), (0.1, 0.1))  # at the start of every toy
+
+
+def test_a_vector_reads_each_list_of_obstacles_once(ready):
+    """It asks again if a state cannot be used. An iterator would then be at its end, as if all space were free."""
+    kinds = []
+    for kind in (list, iter):
+        vector = gymnasium.vector.SyncVectorEnv([lambda one=one: Faulty(one) for one in ("", "nan")])
+        env = VectorSafetyWrapper(
+            vector,
+            ready,
+            accept_bound=1.0,
+            actions=normalised(CAR),
+            obstacles=lambda *_, kind=kind: [kind([WITHIN]) for _ in range(2)],
+        )
+        env.reset(seed=[0, 0])
+        kinds.append([env.step(np.ones((2, 2), np.float32))[4]["diagnostics"]["verified"].tolist() for _ in range(4)])
+    assert kinds[0] == kinds[1]
+
+
 class Walled(Toy):
     """An environment with a scan instead of obstacles: a wall all around."""
 

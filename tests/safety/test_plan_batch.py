@@ -197,6 +197,24 @@ def test_a_step_that_resets_a_robot_compares_and_costs_nothing() -> None:
     env.close()
 
 
+class Single(BatchNavigationEnv):
+    """It states its robots and obstacles in single precision, as simulators on a GPU do."""
+
+    def _infos(self, rows: Any, period: Any) -> Any:
+        infos = super()._infos(rows, period)
+        shapes = {name: array.astype(np.float32) for name, array in infos["obstacles"].items() if name != "count"}
+        return infos | {"state": infos["state"].astype(np.float32), "obstacles": infos["obstacles"] | shapes}
+
+
+def test_states_and_obstacles_in_single_precision_are_decided() -> None:
+    env = BatchSafetyWrapper(Single(GROUND, 2, "dense"), SAFETY)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, infos = env.step(np.tile(np.float32([0.2, 0.0]), (2, 1)))
+        assert infos["outcome"].decided.all() and infos["contained"].all()
+    env.close()
+
+
 class Overwriting(BatchNavigationEnv):
     """It overwrites the inputs that it gets."""
 

@@ -100,7 +100,7 @@ def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:
         if tuple(value.shape) != (B, *shape):
             raise BadRequest(name, f"{name} has shape {tuple(value.shape)}, a batch of {B} requests has {(B, *shape)}")
         if kind in types and value.dtype != types[kind]:
-            raise BadRequest(name, f"{name} has the type {value.dtype}, not {types[kind]}")
+            raise BadRequest(name, f"{name} has the type {value.dtype}, not {'float64' if kind == 'f' else 'bool'}")
     counts = on_host(requests.obstacles.count)
     if counts.size and not (counts.dtype.kind == "i" and counts.min() >= 0 and counts.max() <= K):
         raise BadRequest("obstacles.count", f"obstacles.count holds integers from 0 to {K}, the number of slots")

@@ -19,7 +19,7 @@ from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
 from brakeline.safety.filter.batch.decision_arrays import KINDS, DecisionArrays
-from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, mapped
 from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionArrays, RequestArrays
 from brakeline.safety.filter.request import FAILSAFE
 from brakeline.safety.filter.widening import WINDOWS, widening_factor
@@ -134,8 +134,11 @@ class BackupPlanBatch:
     ) -> BatchOutcome:
         """Decide on proposals (B, m), and commit to the plans of the decisions.
 
+        Arrays in single precision are converted.
+
         observations (B, o): by which a rival decides; the filter does not need them.
         """
+        states, actions, obstacles = np.asarray(states, float), np.asarray(actions, float), mapped(obstacles, _precise)
         usable = _plausible(states) & np.isfinite(actions).all(axis=1)
         if observations is not None:
             usable &= np.isfinite(observations).all(axis=1)
@@ -233,6 +236,11 @@ class BackupPlanBatch:
 def _plausible(states: Array) -> Flags:
     """Return which measured states (B, n) a request may hold."""
     return np.asarray((np.abs(states) <= FARTHEST).all(axis=1))  # NaN fails too
+
+
+def _precise(array: Array) -> Array:
+    """Return an array of numbers in double precision, as requests have them. Integers and flags stay."""
+    return array.astype(float, copy=False) if array.dtype.kind == "f" else array
 
 
 def correction_penalties(robot: Robot, proposed: Array, before: Array, executed: Array, weight: float) -> Array:
