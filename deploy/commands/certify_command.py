@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -279,7 +280,8 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
-            *(percent(s.bound_step), percent(s.bound_plan), percent(s.bound_episode), f"≤ {s.outside_hour:.0f} steps"),
+            *(percent(bound) for bound in (s.bound_step, s.bound_plan, s.bound_episode)),
+            f"≤ {math.ceil(s.outside_hour)} steps",
             *(width(value, s.unit) for value in (s.half_width_rest, s.half_width_full)),
             width(s.clearance_margin),
         )
@@ -300,7 +302,7 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
         f"  a step: at most {percent(s.bound_step)} of steps leave their predicted set ({s.step_violations} did)",
         f"  a plan, driven to its stop: at most {percent(s.bound_plan)} of plans leave their tube ({s.violations} did)",
         f"  an episode of {EPISODE} steps ({EPISODE * period:.0f} s): at most {s.outside_episode:.2g} steps outside on "
-        f"average; at least one in up to {s.bound_episode:.0%} of episodes, if steps are independent",
+        f"average; at least one in up to {percent(s.bound_episode)} of episodes, if steps are independent",
         f"  an hour of driving ({round(HOUR / period):,} steps): at most {s.outside_hour:.3g} steps outside on average",
     ]
     if s.chosen is not None and s.marginal is not None:
