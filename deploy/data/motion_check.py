@@ -22,6 +22,7 @@ from brakeline.deploy.data.unit_table import COMPASS, UNITS, factor, from_si, in
 SPAN = 0.3  # s over which motion is compared with a column: over less, noise dominates
 SAME_CORRELATION = 0.9  # of two columns of the same quantity
 SAME_GAIN = (0.75, 1.33)  # ratio of their standard deviations
+UNRELATED = 0.5  # largest correlation with a column's own quantity, if the column holds another one
 FOLLOWS_CORRELATION = 0.8  # of an input with the motion up to `MAX_LAG` later, so that its gain is its unit's
 MAX_LAG = 1.0  # s
 FEWEST_SPANS = 20  # fewer spans give no result
@@ -202,6 +203,20 @@ def best_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_inp
         if (end := len(means) - lag) >= FEWEST_SPANS
     ]
     return max(fits, default=SpeedFit(0.0, 0.0, ""))
+
+
+def speed_of_the_world(log: AlignedLog, name: str, heading: str) -> str:
+    """Return what to do if a column is a speed along x or y, though the robot has a heading; empty if it is not."""
+    is_input = name in log.inputs
+    if not heading or speed_fit(log, name, speeds_of_motion(log, ""), is_input) is None:
+        return ""
+    if best_fit(log, name, speeds_of_motion(log, heading)[:2], is_input).correlation > UNRELATED:
+        return ""
+    return (
+        f"{name} is a speed along x or y, but a robot with a heading needs speeds in its own frame. Write "
+        f"cos({heading}) * vx + sin({heading}) * vy (ahead) and cos({heading}) * vy - sin({heading}) * vx (to the left)"
+        " into the columns, or describe the robot without a heading"
+    )
 
 
 def span_means(log: AlignedLog, name: str) -> Array:

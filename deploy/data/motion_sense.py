@@ -14,12 +14,14 @@ import numpy as np
 from brakeline.deploy.data.aligned_log import AlignedLog, align
 from brakeline.deploy.data.motion_check import (
     FEWEST_SPANS,
+    UNRELATED,
     best_fit,
     contradictions,
     directions_of_motion,
     likely_unit,
     span_means,
     speed_fit,
+    speed_of_the_world,
     speeds_of_motion,
 )
 from brakeline.deploy.data.sources.quantity_names import Places
@@ -28,7 +30,6 @@ from brakeline.deploy.data.unit_table import AS_IT_IS, unit_option
 from brakeline.errors import NoSource
 
 COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the mean of their differences' unit vectors
-UNRELATED = 0.5  # largest correlation with a column's own quantity, if the column holds another one
 FAR_GAIN = {False: 2.0, True: 5.0}  # of a state, of an input: farther from 1 it is another unit
 BACKWARDS = 0.3  # of the usual top speed: a robot that moves so fast against its heading drives backwards
 CONFIRMED = 0.8  # least correlation of a speed with the motion, if its column and those of the pose are right
@@ -96,7 +97,7 @@ def wrong_senses(log: AlignedLog, heading: str, units: Mapping[str, str], given:
     problems = []
     for name, unit in units.items():
         if unit in QUANTITIES and name in log.columns and given.get(name) != AS_IT_IS:
-            problems.append(_wrong_sense(log, name, unit, speeds))
+            problems.append(_wrong_sense(log, name, unit, speeds) or _in_the_world(log, name, unit, heading))
     return [problem for problem in problems if problem]
 
 
@@ -157,6 +158,12 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
         f"{name} follows the {QUANTITIES[elsewhere.unit]} of the positions, not their {quantity}: are two columns "
         f"swapped? Name the right one with --map {shlex.quote(name)}=COLUMN, {as_it_is}"
     )
+
+
+def _in_the_world(log: AlignedLog, name: str, unit: str, heading: str) -> str:
+    """Return what to do about a speed along x or y of a robot with a heading; empty if it is none."""
+    text = speed_of_the_world(log, name, heading) if unit == "m/s" else ""
+    return f"{text}, or take the column as it is with {unit_option(name, AS_IT_IS)}" if text else ""
 
 
 def _unsigned(means: Array, own: list[Array]) -> bool:

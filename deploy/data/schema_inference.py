@@ -35,6 +35,7 @@ from brakeline.deploy.data.motion_check import (
     same_gain,
     speed_contradiction,
     speed_fit,
+    speed_of_the_world,
     speeds_of_motion,
 )
 from brakeline.deploy.data.sources.quantity_names import (
@@ -298,7 +299,7 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
             f"heading=COLUMN SPEED=COLUMN '{COMMAND} INPUT=COLUMN' …"
         )
     flat = axes.pop("z") if "z" in axes and "z" not in chosen and _is_flat(table.columns[axes["z"]]) else ""
-    notes = (f"left out, as it changes by less than a millimetre: {flat}",) if flat else ()
+    notes: tuple[str, ...] = (f"left out, as it changes by less than a millimetre: {flat}",) if flat else ()
     positions = [axes[axis] for axis in AXES if axis in axes]
     # Those who name columns name all that matter.
     names = (
@@ -379,6 +380,7 @@ def _find_speeds(log: AlignedLog, options: LogOptions) -> list[str]:
             continue
         fit, given = speed_fit(log, name, speeds, name in log.inputs), options.units.get(name)
         if fit is None:
+            notes += [text] if (text := speed_of_the_world(log, name, log.heading)) else []
             continue
         if given is not None:
             if needlessly_converted(fit, given):

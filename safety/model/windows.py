@@ -339,7 +339,8 @@ class RegressorQuality:
 def check_regressors(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> RegressorQuality:
     """Raise BadData if regressors (T, nz) are too few, rank-deficient or nearly collinear; return their quality."""
     if len(z) < fewest:
-        raise BadData(f"{name}: {len(z)} windows, at least {fewest} are needed: record more")
+        needed = f"at least {fewest} are needed"
+        raise BadData(f"{name}: {len(z)} windows, {needed}: record more, or fit with mode one-step, which needs fewer")
     scaled = z / np.maximum(np.abs(z).max(0), 1e-12)
     singular = np.linalg.svd(scaled / np.sqrt(len(z)), compute_uv=False)
     rank = int((singular > 1e-6).sum())

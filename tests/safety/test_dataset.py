@@ -148,7 +148,7 @@ def test_poor_regressors_are_refused():
     rng = np.random.default_rng(0)
     good = rng.normal(size=(400, 3))
     assert check_regressors(good, "these").rank == 3
-    with pytest.raises(BadData, match="at least"):
+    with pytest.raises(BadData, match="at least 200 are needed: record more, or fit with mode one-step"):
         check_regressors(good[:50], "these")
     with pytest.raises(BadData, match="rank 2 of 3"):
         check_regressors(np.column_stack([good[:, :2], good[:, 0] + good[:, 1]]), "these")

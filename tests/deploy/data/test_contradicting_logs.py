@@ -173,6 +173,20 @@ def test_speeds_along_x_and_y_show_no_unit_of_the_heading(tmp_path, capsys):
     assert "looks like" not in capsys.readouterr().out
 
 
+def test_speeds_along_x_and_y_of_a_robot_with_a_heading_are_refused(tmp_path, capsys):
+    """The model set predicts in the robot's frame, so its sets were wide, and a note said only that it may slip."""
+    log, file = omnidirectional_log(tmp_path / "world.csv", along_axes=True), tmp_path / "omni.toml"
+    assert main(["robot", "new", str(file), "--from", str(log)]) == 0
+    said = "is a speed along x or y, but a robot with a heading needs speeds in its own frame"
+    assert f"ahead {said}" in " ".join(capsys.readouterr().out.split())
+    file.write_text(file.read_text().replace('unit = "1"', 'unit = "m/s"'))
+    status, text = imported(log, capsys, robot=file)
+    assert status == 1 and f"aside {said}" in text and "Write cos(heading) * vx + sin(heading) * vy (ahead)" in text
+    names = ("ahead", "aside", "cmd_ahead", "cmd_aside")
+    status, text = imported(log, capsys, "--unit", *(f"{name}=1" for name in names), robot=file)
+    assert status == 0, text
+
+
 def test_late_inputs_are_imported_with_the_delay_that_the_error_names(driven, tmp_path, capsys):
     time, values = driven[0], driven[1].copy()
     late(values, [SPEED, TURN], PERIOD)
