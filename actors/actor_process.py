@@ -37,7 +37,7 @@ from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask, check_penalty, robot_with_task
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from brakeline.safety.filter.request import ALLOWED
-from brakeline.safety.service.client import query_service
+from brakeline.safety.service.service_query import query_service
 from brakeline.safety.service.wire import MAX_REQUESTS
 
 if TYPE_CHECKING:

@@ -45,7 +45,8 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
-from brakeline.safety.service.client import query_service, request_message
+from brakeline.safety.service.client import request_message
+from brakeline.safety.service.service_query import query_service
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import goal_sequence
 from brakeline.sim.navigation_env import NavigationEnv

@@ -28,7 +28,7 @@ from benchmarks.timing import Figures
 from brakeline.errors import BusError, Late
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
-from brakeline.safety.service.client import query_service
+from brakeline.safety.service.service_query import query_service
 
 REPLICAS = (1, 2, 4)
 CLIENTS = (50, 200, 1000)

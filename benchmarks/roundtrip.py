@@ -25,7 +25,7 @@ from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import JOIN
 from brakeline.safety.model.model_config import AUTO
-from brakeline.safety.service.client import query_service
+from brakeline.safety.service.service_query import query_service
 
 REQUESTS = 500
 PLAIN, KEYS, SOCKET, ALONE = "TCP", "with keys", "Unix socket", "the bus alone, TCP"

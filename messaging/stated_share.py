@@ -18,7 +18,7 @@ def rounded_up(bound: float) -> float:
     """Round a bound up to two digits, so that the displayed bound is never below the stated one."""
     if bound <= 0.0:
         return 0.0
-    scale = 10.0 ** (DIGITS - 1 - math.floor(math.log10(bound)))
+    scale = 10.0 ** min(DIGITS - 1 - math.floor(math.log10(bound)), 300)  # a larger one is beyond a float
     return min(max(math.ceil(bound * scale) / scale, bound), 1.0)
 
 

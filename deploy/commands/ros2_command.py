@@ -145,7 +145,7 @@ class Ros2Command:
             return
         from brakeline.messaging.bus import Bus, BusSettings
         from brakeline.messaging.bus.identity import distinct_name
-        from brakeline.safety.service.client import query_service
+        from brakeline.safety.service.service_query import query_service
 
         deadline = 0.3 * lead  # a period may need three requests
 

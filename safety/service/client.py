@@ -8,14 +8,12 @@ with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:
 from __future__ import annotations
 
 import math
-import secrets
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from google.protobuf.message import DecodeError
 from numpy.typing import ArrayLike
 
 from brakeline.errors import BadRequest, SafetyError
@@ -26,7 +24,6 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
-from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.model.model_config import MOST_OUTSIDE
 from brakeline.safety.service.filter_client import (
@@ -39,11 +36,11 @@ from brakeline.safety.service.filter_client import (
     vector_in,
 )
 from brakeline.safety.service.plan_token import SIZE
-from brakeline.safety.service.wire import array_of, decision_of, digest, reservation_message, reservation_of
+from brakeline.safety.service.service_query import query_service
+from brakeline.safety.service.wire import array_of, bad_reply, decision_of, reservation_message, reservation_of
 
 DEADLINE = 0.1  # s
 LONGEST_DEADLINE = 86400.0  # s
-NONCE = 16  # bytes
 SAME_INPUT = 1e-9  # rounding error allowed between two equal inputs
 
 
@@ -124,9 +121,9 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
             another field is not valid, or it says that a plan is verified and lacks what the verification gives.
     """
     if (result := reply.WhichOneof("result")) != "decision":
-        raise _bad_reply("", "neither a decision nor an error") if result is None else SafetyError(reply.error)
+        raise bad_reply("", "neither a decision nor an error") if result is None else SafetyError(reply.error)
     if reply.robot != robot.name:
-        raise _bad_reply("robot", f"a decision about {reply.robot[:100]!r}")
+        raise bad_reply("robot", f"a decision about {reply.robot[:100]!r}")
     decision = reply.decision
     _check_plan(decision, request, robot)
     _check_prediction(decision, robot)
@@ -138,7 +135,7 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
             reservation_of(decision.reservation, robot)
         answer = decision_of(decision, robot)
     except BadRequest as error:
-        raise _bad_reply(error.field, str(error)) from error
+        raise bad_reply(error.field, str(error)) from error
     plan_tokens = tuple(decision.plan_tokens)
     return Answer.of(
         answer, robot, queue_ms=decision.queue_ms, token_rejected=decision.token_rejected, plan_tokens=plan_tokens
@@ -149,60 +146,60 @@ def _check_plan(decision: pb.Decision, request: pb.Request, robot: Robot) -> Non
     """Raise SafetyError if the robot cannot execute the plan after the input in force."""
     plan = array_of(decision.plan)
     if plan.size != robot.horizon * robot.action_dim:
-        raise _bad_reply("plan", f"a plan of {plan.size} numbers")
+        raise bad_reply("plan", f"a plan of {plan.size} numbers")
     plan = plan.reshape(robot.horizon, robot.action_dim)
     low, high = robot.bounds
     if not ((plan >= low) & (plan <= high)).all():  # NaN fails too
-        raise _bad_reply("plan", "an input out of bounds")
+        raise bad_reply("plan", "an input out of bounds")
     if not robot.is_stop_input(plan[-1]):
-        raise _bad_reply("plan", "a plan that does not end in a stop")
+        raise bad_reply("plan", "a plan that does not end in a stop")
     if not _follows(plan, request, robot):
-        raise _bad_reply("plan", "a plan that does not follow the input in force")
+        raise bad_reply("plan", "a plan that does not follow the input in force")
 
 
 def _check_prediction(decision: pb.Decision, robot: Robot) -> None:
     """Raise SafetyError if the predicted set of the next state or the margin is not valid."""
     sizes = {len(decision.predicted_center), len(decision.predicted_half_width)}
     if sizes not in ({robot.state_dim}, {0}):  # the rivals predict nothing
-        raise _bad_reply("predicted_center", "a predicted state of the wrong size")
+        raise bad_reply("predicted_center", "a predicted state of the wrong size")
     numbers = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
     if not all(map(math.isfinite, numbers)) or min(decision.predicted_half_width, default=0.0) < 0.0:
-        raise _bad_reply("predicted_center", "a predicted state or a margin that is not valid")
+        raise bad_reply("predicted_center", "a predicted state or a margin that is not valid")
 
 
 def _check_figures(decision: pb.Decision, robot: Robot) -> None:
     """Raise SafetyError if what the decision states beside its plan and sets is not valid."""
     for name in ("time_ms", "solve_ms", "verify_ms", "queue_ms"):
         if not math.isfinite(getattr(decision, name)):
-            raise _bad_reply(name, "a time that is not finite")
+            raise bad_reply(name, "a time that is not finite")
     if not 0.0 <= decision.bound <= 1.0:  # NaN fails too
-        raise _bad_reply("bound", "a bound that is no share of plans")
+        raise bad_reply("bound", "a bound that is no share of plans")
     if not 0.0 <= decision.outside_share <= MOST_OUTSIDE:
-        raise _bad_reply("outside_share", f"a share of windows outside that is not within 0 and {MOST_OUTSIDE:g}")
+        raise bad_reply("outside_share", f"a share of windows outside that is not within 0 and {MOST_OUTSIDE:g}")
     for name in ("score", "plan_score"):
         if not getattr(decision, name) >= 0.0:  # infinity is a score
-            raise _bad_reply(name, "a score that is no ratio")
+            raise bad_reply(name, "a score that is no ratio")
     if len(decision.plan_tokens) > robot.horizon + 1 or any(len(token) != SIZE for token in decision.plan_tokens):
-        raise _bad_reply("plan_tokens", "plan tokens of the wrong size or number")
+        raise bad_reply("plan_tokens", "plan tokens of the wrong size or number")
     stopped = decision.stopped
     if {len(stopped.normal), len(stopped.at)} not in ({robot.position_dim}, {0}):
-        raise _bad_reply("stopped", "a constraint in another number of coordinates")
+        raise bad_reply("stopped", "a constraint in another number of coordinates")
     if math.isnan(stopped.room) or not all(map(math.isfinite, (stopped.after, *stopped.normal, *stopped.at))):
-        raise _bad_reply("stopped", "a constraint that holds NaN or infinity")
+        raise bad_reply("stopped", "a constraint that holds NaN or infinity")
 
 
 def _check_verified(decision: pb.Decision, robot: Robot) -> None:
     """Raise SafetyError if a decision says that its plan is verified, and lacks what each verification gives."""
     if decision.model in ("", UNVERIFIED):  # an empty one would say that the robot stands
-        raise _bad_reply("model", "a verified plan without the model that verified it")
+        raise bad_reply("model", "a verified plan without the model that verified it")
     if decision.kind == pb.RECOVERING:
-        raise _bad_reply("kind", "a verified plan to recover: nothing verifies such plans")
+        raise bad_reply("kind", "a verified plan to recover: nothing verifies such plans")
     if len(decision.tube_center) != robot.horizon * robot.position_dim:
-        raise _bad_reply("tube_center", "a verified plan without its tube")
+        raise bad_reply("tube_center", "a verified plan without its tube")
     if not decision.predicted_center:
-        raise _bad_reply("predicted_center", "a verified plan without the predicted state")
+        raise bad_reply("predicted_center", "a verified plan without the predicted state")
     if not decision.HasField("bound"):
-        raise _bad_reply("bound", "a verified plan without the bound that its model set states")
+        raise bad_reply("bound", "a verified plan without the bound that its model set states")
 
 
 def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
@@ -221,10 +218,6 @@ def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
     if robot.feedback:
         steps[1:, robot.stops_by_feedback] = 0.0
     return bool((steps <= robot.slew + SAME_INPUT).all())
-
-
-def _bad_reply(field: str, message: str) -> SafetyError:
-    return SafetyError(pb.Error(type="BadReply", field=field, message=message))
 
 
 def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> Bus:
@@ -377,23 +370,3 @@ class SafetyClient(BusClient):
     def reset(self) -> None:
         """Begin an episode with a robot that stands still."""
         self.backup_plan.reset()
-
-
-def query_service(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:
-    """Query the service with requests about robots of one kind, and return the replies in their order.
-
-    Raises:
-        NoReply, Late, Refused: no service replied, or not in time, or it could not read the query.
-        SafetyError: the reply is not a batch, has another number of replies, or belongs to another query.
-    """
-    payload = pb.RequestBatch(requests=requests, nonce=secrets.token_bytes(NONCE)).SerializeToString()
-    answer = bus.ask(DECIDE, payload, deadline, robot=requests[0].robot)
-    try:
-        batch = pb.ReplyBatch.FromString(answer)
-    except DecodeError as error:
-        raise _bad_reply("", f"not a reply batch: {error}") from error
-    if batch.request != digest(payload):
-        raise _bad_reply("request", "replies to another query")
-    if len(batch.replies) != len(requests):
-        raise _bad_reply("", f"{len(batch.replies)} replies to {len(requests)} requests")
-    return list(batch.replies)

@@ -21,11 +21,11 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import (
     DEADLINE,
     BusClient,
-    query_service,
     read_reply,
     request_message,
 )
 from brakeline.safety.service.filter_client import Answer, accept, obstacle_lists
+from brakeline.safety.service.service_query import query_service
 from brakeline.safety.service.wire import MAX_REQUESTS
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from brakeline.errors import BadRequest, BadScan, BadShape
+from brakeline.errors import BadRequest, BadScan, BadShape, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
 from brakeline.messaging.obstacle import FARTHEST, Obstacle, Shapes
@@ -293,3 +293,8 @@ def error_reply(error: Exception) -> pb.Reply:
     """Return the reply with an error: its type, its field if it has one, and its message."""
     name = type(error).__name__
     return pb.Reply(error=pb.Error(type=name, field=str(getattr(error, "field", "")), message=str(error)))
+
+
+def bad_reply(field: str, message: str) -> SafetyError:
+    """Return the error that a client raises because of a reply that is not valid."""
+    return SafetyError(pb.Error(type="BadReply", field=field, message=message))

@@ -35,7 +35,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.bus.bus_settings import open_session
 from brakeline.messaging.topics import DECIDE, STEP
-from brakeline.safety.service.client import query_service
+from brakeline.safety.service.service_query import query_service
 
 RATE = 50.0  # Hz of the asker
 DEADLINE = 0.1  # s

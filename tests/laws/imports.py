@@ -26,7 +26,8 @@ PARTS: dict[str, tuple[str, ...]] = {
             "safety.perception.scan_coverage",
             "safety.perception.visibility_memory",
         ),
-        *("safety.service.filter_client", "safety.service.client", "safety.service.wire"),
+        *("safety.service.filter_client", "safety.service.client", "safety.service.service_query"),
+        "safety.service.wire",
     ),
     "learner": ("messaging", "errors"),
     # The viewers draw the map that the filter was shown. An analysis counts by kind of driving, as statements do.

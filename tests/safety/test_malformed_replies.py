@@ -18,8 +18,9 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.service.client import query_service, read_reply, request_message
+from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.filter_client import accept
+from brakeline.safety.service.service_query import query_service
 from brakeline.safety.service.wire import digest, request_of
 from tests.safety.served import Service, with_fields
 

@@ -17,7 +17,8 @@ from brakeline.messaging.robot import Disc
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE
-from brakeline.safety.service.client import SafetyClient, query_service, read_reply, request_message
+from brakeline.safety.service.client import SafetyClient, read_reply, request_message
+from brakeline.safety.service.service_query import query_service
 from brakeline.safety.service.wire import MAX_BATCH_SIZE
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
@@ -277,6 +278,30 @@ def test_a_replayed_reply_is_refused(service):
         with pytest.raises(SafetyError) as caught:
             query_service(answering(recorded[0]), [question], 0.1)
         assert caught.value.field == "request"
+
+
+@pytest.mark.parametrize("many", [{"obstacles": [AHEAD] * 60}, {"observation": np.zeros(4096, np.float32)}])
+def test_requests_that_are_too_large_for_one_batch_go_in_several(service, many):
+    """Forty robots with range images asked in vain. A fleet's requests stay together, so these are refused."""
+
+    class Asked:
+        batches = 0
+
+        def ask(self, topic, payload, timeout, **names):
+            self.batches += 1
+            return service.answer(payload)
+
+    bus, requests = Asked(), []
+    for i in range(64):
+        action = [0.003 * i, 0.0]
+        requests.append(request_message(BackupPlan(GROUND), np.zeros(5), action, known_free=True, **many))
+    replies = query_service(bus, requests, 1.0)
+    wanted = [request.action[0] for request in requests]
+    assert bus.batches > 1 and [reply.decision.plan[0] for reply in replies] == pytest.approx(wanted)
+    for i, request in enumerate(requests):
+        request.actor, request.fleet[:] = f"robot-{i}", [f"robot-{k}" for k in range(64)]
+    with pytest.raises(BadRequest):
+        query_service(bus, requests, 1.0)
 
 
 def test_a_plan_that_violates_the_slew_limit_is_refused():

@@ -84,6 +84,7 @@ def test_a_suggested_bound_is_accepted_and_a_shown_one_is_rounded_up():
         assert bound <= rounded_up(bound) <= min(1.1 * bound, 1.0)
         assert float(f"{rounded_up(bound):g}") >= bound
     assert [percent(bound) for bound in (0.01, 0.0113, 0.2613)] == ["1 %", "1.2 %", "27 %"]
+    assert 0.0 < rounded_up(2e-311) < 1e-299, "a reply may hold any number"
     assert plans_needed(0.01) == 459
 
 
