@@ -18,10 +18,12 @@ def body_clearance(robot: Robot, shapes: Shapes, states: Array) -> Array:
         shapes: the obstacles.
         states: (..., n), or positions (..., d) of a robot whose discs are all about the position.
     """
+    if not (len(shapes) and robot.body):
+        return np.full(states.shape[:-1], np.inf)
     centers = np.array([disc.at for disc in robot.body])
     positions = states[..., None, : robot.position_dim] + np.zeros_like(centers)
     if robot.heading is not None and centers.any():
         turned = np.broadcast_to(centers, positions.shape)
         positions = positions + rotate(turned, states[..., robot.heading, None])
-    apart = shapes.distance(positions).min(axis=0, initial=np.inf) - [disc.radius for disc in robot.body]
-    return np.asarray(apart.min(axis=-1, initial=np.inf))
+    apart = shapes.distance(positions).min(axis=0) - [disc.radius for disc in robot.body]
+    return np.asarray(apart.min(axis=-1))

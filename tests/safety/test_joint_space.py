@@ -1,5 +1,6 @@
 """Robots without a position: their limits are kept as obstacles are, and space is no word about them."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from brakeline.deploy.cli import main as brakeline
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.environment_episodes import collect
+from brakeline.deploy.run.recorded_client import RecordedClient
 from brakeline.errors import BadDescription, BadRequest, BadShape, ErrorBoundError
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot_description import describe, robot_from_description
@@ -229,6 +231,16 @@ def test_any_number_of_joints():
     assert answer.kind == ADJUSTED and answer.action[1] == pytest.approx(-1.0, abs=0.03)
     alone = slow_inputs(joints(7))
     assert len(alone) == 1 + 3 * 7 and (np.count_nonzero(alone, axis=1) <= 1).all()
+
+
+def test_a_robot_in_joint_space_can_be_recorded_and_analysed(tmp_path, capsys):
+    """Its steps have no clearance. The second request ended in a traceback."""
+    with RecordedClient(safety(), tmp_path / "mine") as client:
+        assert [client.decide(np.zeros(4), np.zeros(2)).kind for _ in range(3)] == 3 * [ALLOWED]
+    capsys.readouterr()
+    assert brakeline(["analyse", str(tmp_path / "mine"), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["steps"] == 2 and figures["closest_approach"] is None
 
 
 # --- space is no word ---------------------------------------------------------------------------------------------
