@@ -45,6 +45,7 @@ from brakeline.safety.filter.request import (
     check_surroundings,
 )
 from brakeline.safety.filter.reservation import Reservation
+from brakeline.safety.filter.standing import stands
 from brakeline.safety.filter.turning_aside import find_plan
 from brakeline.safety.filter.window_score import WindowScore
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
@@ -297,18 +298,19 @@ class Filter:
         """
         if not record.contained:
             record.reason += "; the measured state was outside the predicted set"
-        was_verified = (request.model == self.version and not record.broken) or request.still(self.robot)
-        if _touches_another(request):
-            record.reason += "; the robot's reservation touches another robot's"
-            was_verified = False
         before = z_0[-self.robot.action_dim :]
         tail = request.plan
         if self.robot.feedback:  # a feedback decides this period's input from the measured state
             tail = np.vstack([self.robot.stop_by_feedback(tail[:1], request.state, before), tail[1:]])
         chosen = tail[self.robot.committed_steps : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
+        constraints = self.constraints_for(as_committed, local_map.widening)
+        was_verified = request.model == self.version and not record.broken
+        was_verified |= stands(request, local_map, constraints, as_committed)
+        if request.touches_another:
+            record.reason += "; the robot's reservation touches another robot's"
+            was_verified = False
         if record.contained and was_verified:
-            constraints = self.constraints_for(as_committed, local_map.widening)
             margin = constraints.margin_in(local_map, as_committed)
             return PlanCandidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
         brake = self.inputs.regressors(z_0, self.executable.stop(request.state, before))
@@ -389,9 +391,3 @@ class Filter:
         chord_deviations[-1] = max(chord_deviations[-1], stopping_distance)
         centers, half = np.vstack([start, centers]), np.vstack([constraints.measured, half])
         return Reservation.of(centers, half, self.robot.footprint + np.array(chord_deviations))
-
-
-def _touches_another(request: Request) -> bool:
-    """Return whether the robot's reservation touches another robot's."""
-    own, others = request.reservation, request.other_reservations
-    return own is not None and others is not None and others.touch(own)

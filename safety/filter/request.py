@@ -114,6 +114,12 @@ class Request(ComparedByValue):
         )
         return committed and robot.is_standing(self.state)
 
+    @property
+    def touches_another(self) -> bool:
+        """Whether the robot's reservation touches another robot's."""
+        own, others = self.reservation, self.other_reservations
+        return own is not None and others is not None and others.touch(own)
+
 
 @dataclass(frozen=True, eq=False)
 class Decision(ComparedByValue):

@@ -17,13 +17,30 @@ from brakeline.safety.filter.blocking_constraint import SIGHT, why_not_allowed
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, Request
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import decision_reply
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
+
+
+@pytest.mark.parametrize(("speed", "gap"), [(1.0, 0.2), (3.0, 0.65), (6.0, 4.0)])
+def test_a_robot_that_flies_when_its_program_begins_has_no_verified_plan_to_stand(speed, gap):
+    """Its first request names no plan, as that of a standing robot does."""
+    ready, rng = Filter.load("quadrotor"), np.random.default_rng(0)
+    ahead = Shapes.of([Obstacle("sphere", (QUADROTOR.footprint + gap + 0.5, 0.0, 0.0), (0.5,))], 3)
+    hover = np.zeros((QUADROTOR.horizon, 3))
+    flying = np.array([0.0, 0.0, 0.0, speed, *np.zeros(5)])
+    first = Request(state=flying, action=np.array([5.0, 0, 0]), input_in_force=hover[0], plan=hover, obstacles=ahead)
+    decision = ready.decide(first)
+    assert (decision.kind, decision.verified) == (FAILSAFE, False)
+    bound = np.array(QUADROTOR.measurement_bound)
+    for state in rng.uniform(-bound, bound, (50, 9)):  # one that stands, as it may be measured
+        near = Shapes.of([Obstacle("sphere", (QUADROTOR.footprint + 0.55, 0.0, 0.0), (0.5,))], 3)
+        decision = ready.decide(replace(first, state=state, action=np.full(3, np.nan), obstacles=near))
+        assert (decision.kind, decision.verified) == (FAILSAFE, True)
 
 
 @pytest.mark.parametrize("way", [0.28, 0.35, 0.45, 0.7])

@@ -1,0 +1,26 @@
+"""Whether a robot stands: by its request, and by what the model set predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brakeline.messaging.robot import Array
+from brakeline.safety.filter.constraints import TubeConstraints
+from brakeline.safety.filter.local_map import LocalMap
+from brakeline.safety.filter.request import Request
+
+
+def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array) -> bool:
+    """Return whether the robot stands and its plan is to stand. No model set needs to verify that.
+
+    The first request of a program may be about a robot that drives already. Nothing was predicted of it. So the model
+    set must not predict that it leaves its place.
+
+    Args:
+        z: regressors of the plan.
+    """
+    robot = constraints.robot
+    if not request.still(robot) or request.predicted is not None or not robot.position_dim:
+        return request.still(robot)
+    centers, half = constraints.sets(local_map.start, local_map.turn, z)
+    return bool((np.abs(centers - local_map.start) <= half + constraints.measurement_error).all())
