@@ -25,7 +25,7 @@ class ActorCommand:
     name: str = f"actor-{os.uname().nodename.split('.')[0]}"
     """Give the actor this name on the bus. Each actor of a run needs its own."""
     number: int = 0
-    """Count the robots of this process from this number on. Robots with the same number and seed see the same
+    """Number the robots of this process from this number on. Robots with the same number and seed see the same
     episodes."""
     robots: int = 1
     """Run this many robots in this process. They share one request to the safety service."""

@@ -41,7 +41,8 @@ class CampaignCommand:
     """Change the robot like this: as-recorded, noisy, payload, weak-motor, slippery, uneven (ground robots), wind (in
     the air), scan or faulty-scan."""
     episodes: int = 1000
-    """Drive this many episodes of each cell. A later campaign with more episodes continues after these."""
+    """Drive this many episodes for each combination of arena, policy, model set and perturbation (a cell). A later
+    campaign with more episodes continues after these."""
     search: int = 0
     """Also search for the worst case of each arena, model set and perturbation, for this many episodes."""
     near: float | None = None
@@ -50,9 +51,9 @@ class CampaignCommand:
     accept_bound: options.AcceptBound = None
     engine: options.Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     again: bool = False
-    """Delete the results of these parts first, and drive them again."""
+    """Delete the stored results of the same cells first, and drive them again."""
     results: Path = Path("results/campaign")
-    """Store the tables in this folder. A table keeps the cells of earlier campaigns."""
+    """Store the tables in this folder. The cells of earlier campaigns stay in the tables."""
     runs: Path = Path("runs/campaign")
     """Store the rows of all episodes, and the logs of those that came too near, in this folder."""
     quiet: options.Quiet = False

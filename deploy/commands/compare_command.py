@@ -78,11 +78,12 @@ class CompareCommand:
     """
     engine: Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     tune: bool = False
-    """Try four values of one setting of each rival instead of comparing, and store the results for the results page."""
+    """Instead of comparing, try some values of one setting of each rival, and store the results for the results
+    page."""
     table: bool = False
     """Run nothing: write tables, figures and the results page (README.md) from the stored results."""
     again: bool = False
-    """Delete the results of these parts first, and run them again."""
+    """Delete the stored results of these trainings (with --tune: of these trials) first, and run them again."""
     conservatism: bool = True
     """Also make the table of error bounds and modes, if a policy of the robot is stored."""
     penalty: float | None = None

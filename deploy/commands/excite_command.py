@@ -21,7 +21,8 @@ class ExciteCommand:
 
     robot: Robot = "ground"
     keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
-    """Stay in this region: least x, least y, greatest x, greatest y [m]. Each run starts in its middle, along x."""
+    """Stay in this region: least x, least y, greatest x, greatest y [m]. Each run starts in the middle of
+    the region, and heads along x."""
     minutes: float = 10.0
     """Drive for this long [min]."""
     seed: Seed = 0

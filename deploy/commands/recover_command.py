@@ -21,8 +21,8 @@ class RecoverCommand:
     """Repair these log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays
     beside it as *.mcap.damaged."""
     out: Path | None = None
-    """Write the repaired log of one file here, without the files that continue it, and leave the damaged one as it
-    is."""
+    """Repair one file only, without the files that continue its log: write the repaired file here, and leave the
+    damaged one as it is."""
     quiet: Quiet = False
     json: Json = False
 

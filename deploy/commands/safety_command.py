@@ -27,8 +27,8 @@ class SafetyCommand:
     adapt: bool = False
     """Certify a robot anew while it drives. If the filter widens the sets of the robot for some time, a certifier
     process fits a model set to the last minutes and puts it to use. The certifier learns from the steps that `brakeline
-    actor` publishes on the bus; programs with a `SafetyClient` and `brakeline ros2` publish none. It needs the keys of
-    `certify` in --keys. Give this option to one replica."""
+    actor` publishes on the bus; programs with a `SafetyClient` and `brakeline ros2` publish none. The certifier needs
+    the keys of `certify` in --keys. Give this option to one replica."""
 
     def run(self) -> int:
         """Answer requests until SIGINT or SIGTERM. Returns the exit status."""

@@ -40,7 +40,8 @@ class WatchCommand:
     foxglove_port: int = 8765
     """Let Foxglove connect at this port. 0 takes any free port; -1 starts no server."""
     origins: tuple[str, ...] = ORIGINS
-    """Let these web pages connect to the Foxglove server, such as https://app.foxglove.dev. Programs always may."""
+    """Let these web pages connect to the Foxglove server, such as https://app.foxglove.dev. Programs other than
+    browsers may always connect."""
     report: Path | None = None
     """Link to the report of the run in this folder when the run has ended. Defaults to the newest run on this machine
     if you give no endpoint."""

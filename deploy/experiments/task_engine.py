@@ -56,7 +56,7 @@ def unsaid(name: str, text: str) -> None:
 
 @dataclass(frozen=True)
 class Engine:
-    """Choose where the parts of a study run. Raises ValueError: there is no worker."""
+    """Choose where the parts of a study run."""
 
     workers: int = 1
     """Use this many processes of this machine at once, each on one core."""
@@ -65,6 +65,7 @@ class Engine:
     one at this address. A part whose machine dies runs again. You need the extra ray."""
 
     def __post_init__(self) -> None:
+        """Raises ValueError: there is no worker."""
         if self.workers < 1:
             raise ValueError(f"--workers is a number from 1 on, not {self.workers}")
 
