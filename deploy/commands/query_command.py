@@ -62,11 +62,14 @@ class QueryCommand:
     occupied."""
     known_free: bool = False
     """Declare that all space outside the obstacles is free. Give it if you give neither --obstacle nor --scan."""
+    acceleration_age: float = 0.0
+    """The state holds the horizontal acceleration of this long ago [s]."""
     timeout: float = 1.0
     """Wait this long for the answer [s]."""
     json: Json = False
 
     above: ClassVar[dict[str, float]] = {"timeout": 0}
+    least: ClassVar[dict[str, float]] = {"acceleration_age": 0}
 
     def run(self) -> int:
         """Ask, and print the decision. Returns the exit status."""
@@ -79,7 +82,7 @@ class QueryCommand:
         action = self.action or robot.action_high
         scan = None if self.scan is None else load_scan(self.scan, robot.position_dim)
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
-            client = SafetyClient(bus, robot, self.timeout)
+            client = SafetyClient(bus, robot, self.timeout, self.acceleration_age)
             answer = client.decide(state, action, obstacles, scan=scan, known_free=self.known_free)
         figures = {name: getattr(answer, name) for name in SHOWN}
         figures |= {name: value.tolist() for name, value in figures.items() if isinstance(value, np.ndarray)}

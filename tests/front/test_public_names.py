@@ -163,6 +163,12 @@ def test_a_wheel_has_everything(wheel):
     assert {p for p in tracked.stdout.split() if p.endswith(".py")} <= files, "a package is missing in pyproject.toml"
 
 
+def test_the_package_runs_the_command_line(tmp_path):
+    words = [sys.executable, "-P", "-m", "brakeline", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.startswith("brakeline ")
+
+
 def test_the_shipped_model_sets_and_policies_work_outside_the_checkout(wheel):
     """A fresh machine with nothing but the package decides, and refuses what hits a wall."""
     code = """

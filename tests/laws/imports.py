@@ -38,6 +38,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "errors": ("messaging.brakeline_pb2",),  # for its types alone
     "compilation": (),
     "envs": ("sim.registration",),
+    "__main__": ("deploy.cli",),
     "extras": ("errors",),
     "robots": (),
     "policies": (),

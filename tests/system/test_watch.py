@@ -130,6 +130,9 @@ def test_status_and_query_of_a_run_in_progress(run: Run, tmp_path: Path) -> None
         scanned = brakeline(*query, "--scan", tmp_path / "scan.json", "--json")
         assert json.loads(scanned.stdout)["kind"] in said
     assert "BadRequest" in refused("query", "ground", *run.there, "--known-free", "--state", 1, 2)
+    assert "acceleration of 0 s ago" in refused(
+        "query", "ground", *run.there, "--known-free", "--acceleration-age", 0.2
+    )
 
 
 def test_each_process_imports_only_what_it_needs(run: Run) -> None:
