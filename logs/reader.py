@@ -297,7 +297,7 @@ def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:
 
 
 def without_copies(paths: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the files without runs that are copies of another run in their folder, such as a backup of its file.
+    """Return the files, but not those of a run that is a copy of another run in its folder, such as a backup.
 
     A copy begins with the same message. Of a run and its copy, the one with more messages stays, or the older one.
     """

@@ -205,7 +205,7 @@ def best_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_inp
     return max(fits, default=SpeedFit(0.0, 0.0, ""))
 
 
-def speed_of_the_world(log: AlignedLog, name: str, heading: str) -> str:
+def world_speed_advice(log: AlignedLog, name: str, heading: str) -> str:
     """Return what to do if a column is a speed along x or y, though the robot has a heading; empty if it is not."""
     is_input = name in log.inputs
     if not heading or speed_fit(log, name, speeds_of_motion(log, ""), is_input) is None:

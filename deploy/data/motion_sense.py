@@ -21,8 +21,8 @@ from brakeline.deploy.data.motion_check import (
     likely_unit,
     span_means,
     speed_fit,
-    speed_of_the_world,
     speeds_of_motion,
+    world_speed_advice,
 )
 from brakeline.deploy.data.sources.quantity_names import Places
 from brakeline.deploy.data.sources.source_table import Array
@@ -97,7 +97,7 @@ def wrong_senses(log: AlignedLog, heading: str, units: Mapping[str, str], given:
     problems = []
     for name, unit in units.items():
         if unit in QUANTITIES and name in log.columns and given.get(name) != AS_IT_IS:
-            problems.append(_wrong_sense(log, name, unit, speeds) or _in_the_world(log, name, unit, heading))
+            problems.append(_wrong_sense(log, name, unit, speeds) or _world_speed_problem(log, name, unit, heading))
     return [problem for problem in problems if problem]
 
 
@@ -160,9 +160,9 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
     )
 
 
-def _in_the_world(log: AlignedLog, name: str, unit: str, heading: str) -> str:
+def _world_speed_problem(log: AlignedLog, name: str, unit: str, heading: str) -> str:
     """Return what to do about a speed along x or y of a robot with a heading; empty if it is none."""
-    text = speed_of_the_world(log, name, heading) if unit == "m/s" else ""
+    text = world_speed_advice(log, name, heading) if unit == "m/s" else ""
     return f"{text}, or take the column as it is with {unit_option(name, AS_IT_IS)}" if text else ""
 
 

@@ -35,8 +35,8 @@ from brakeline.deploy.data.motion_check import (
     same_gain,
     speed_contradiction,
     speed_fit,
-    speed_of_the_world,
     speeds_of_motion,
+    world_speed_advice,
 )
 from brakeline.deploy.data.sources.quantity_names import (
     AXES,
@@ -380,7 +380,7 @@ def _find_speeds(log: AlignedLog, options: LogOptions) -> list[str]:
             continue
         fit, given = speed_fit(log, name, speeds, name in log.inputs), options.units.get(name)
         if fit is None:
-            notes += [text] if (text := speed_of_the_world(log, name, log.heading)) else []
+            notes += [text] if (text := world_speed_advice(log, name, log.heading)) else []
             continue
         if given is not None:
             if needlessly_converted(fit, given):

@@ -62,10 +62,10 @@ class LoggedSteps:
 
     def __iter__(self) -> Iterator[pb.Step]:
         check_logs(self.logs, self.robot)
-        intake, starts = StepReader(self.robot), _Starts()
+        intake, earlier = StepReader(self.robot), _EarlierLogs()
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
             ledger, sessions = StepLedger(), _Sessions()
-            starts.begin_log()
+            earlier.begin_log()
             log_of_run = open_log(files)
             for record in log_of_run:
                 if record.topic != "step" or record.message.robot != self.robot.name:
@@ -77,7 +77,7 @@ class LoggedSteps:
                     self.counts["unusable"] += 1
                     self.reason = self.reason or str(error)
                     continue
-                if starts.is_copied(step):
+                if earlier.is_copied(step):
                     self.counts["duplicate"] += 1
                     continue
                 step.actor = sessions.name(step)
@@ -104,22 +104,22 @@ def check_logs(logs: Sequence[str], robot: RobotWithTask) -> None:
         check_described(path, robot, log_file.metadata.get("robots", {}).get(robot.kind, ""), SCALES)
 
 
-class _Starts:
-    """Tells which steps of a log an earlier log has. A folder may have a copy of a log, also of its first part only."""
+class _EarlierLogs:
+    """Tells which steps of a log are in an earlier log. A folder may hold a copy of a log, or of its first part."""
 
     def __init__(self) -> None:
         self._earlier: dict[tuple[str, int], tuple[int, int]] = {}  # by start of an actor: its first and last step [ns]
         self._here: dict[tuple[str, int], tuple[int, int]] = {}
 
     def begin_log(self) -> None:
-        """Note that the next step is of another log."""
+        """Begin the next log."""
         for start, (first, last) in self._here.items():
             known = self._earlier.get(start)
             self._earlier[start] = (first, last) if known is None or known[0] != first else (first, max(last, known[1]))
         self._here = {}
 
     def is_copied(self, step: pb.Step) -> bool:
-        """Return whether an earlier log has this step: the same start of its actor, up to this time or a later one."""
+        """Return whether an earlier log has this step: its steps of this actor begin alike, and end no sooner."""
         start, now = (step.actor, step.header.run), step.header.wall_time
         first, last = self._here.get(start, (now, now))
         self._here[start] = first, max(last, now)

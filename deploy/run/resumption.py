@@ -12,7 +12,7 @@ from brakeline.learner import checkpoint
 
 
 def check_resumable(config: RunConfig, folder: Path) -> None:
-    """Check that each learner of the run has a checkpoint, so that none begins anew without a word, and needs steps.
+    """Check that each learner of the run has a checkpoint to go on from, and no more steps than are asked for.
 
     Args:
         config: of the run that goes on. With other steps than in the folder, it replaces the configuration there.

@@ -349,16 +349,21 @@ def test_steps_of_another_description_are_refused(tmp_path):
             from_log(log, robot, last=60)
 
 
-@pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
-def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch, capsys, failure):
+def interrupt(monkeypatch, after: int, failure: type[BaseException]) -> None:
+    """Let every recording fail after so many trajectories."""
     parts = collect.record_parts
 
     def interrupted(*given):
-        yield next(parts(*given))[:2]
+        yield next(parts(*given))[:after]
         raise failure
 
+    monkeypatch.setattr(collect, "record_parts", interrupted)
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch, capsys, failure):
     with monkeypatch.context() as patch:
-        patch.setattr(collect, "record_parts", interrupted)
+        interrupt(patch, 2, failure)
         with pytest.raises(failure):
             simulated_recording.load_or_record(GROUND, trajectories=4)
     assert not data_paths.record_path(GROUND).exists()
@@ -373,14 +378,9 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch,
 
 def test_an_interrupted_recording_of_another_number_of_trajectories_is_not_gone_on_from(short, monkeypatch, tmp_path):
     """With 4 trajectories there are as many restless ones as with 3, but they begin one place later."""
-    parts, path = collect.record_parts, tmp_path / "record.safetensors"
-
-    def interrupted(*given):
-        yield next(parts(*given))[:5]
-        raise KeyboardInterrupt
-
+    path = tmp_path / "record.safetensors"
     with monkeypatch.context() as patch:
-        patch.setattr(collect, "record_parts", interrupted)
+        interrupt(patch, 5, KeyboardInterrupt)
         with pytest.raises(KeyboardInterrupt):
             simulated_recording.load_or_record(GROUND, path, trajectories=4)
     other = simulated_recording.load_or_record(GROUND, path, trajectories=3)
