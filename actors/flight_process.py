@@ -268,6 +268,7 @@ def takeoff_verified(
     start = np.array(stage.start[: robot.position_dim])
     state = np.concatenate([start, np.zeros(robot.state_dim - len(start))])
     distances = stage.shapes.distance(start)
+    place = f", {distances.min():.2f} m from the nearest obstacle," if len(distances) else ""
     near = [obstacle for obstacle, far in zip(stage.obstacles, distances, strict=True) if far <= robot.sight]
     logged = ""
     while not stop():
@@ -277,9 +278,9 @@ def takeoff_verified(
         if outcome.answer is not None:
             if filtered and outcome.answer.kind not in (ALLOWED, ADJUSTED):
                 raise TakeoffNotVerified(
-                    f"not taking off: hovering at the start, {distances.min():.2f} m from the nearest obstacle, can't "
-                    f"be verified ({outcome.answer.reason}). The model set's error bound is too large for so little "
-                    "room: collect more data, or fly where there is more room"
+                    f"not taking off: hovering at the start{place} can't be verified ({outcome.answer.reason}). The "
+                    "model set's error bound is too large for so little room: collect more data, or fly where there is "
+                    "more room"
                 )
             return True
         if outcome.failure != logged:

@@ -15,7 +15,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 # Parts of the latency from an actor's request to the reply.
 PARTS = {
     "round_trip": "from the request to the reply, measured by the actor",
-    "network": "the rest of the round trip: bus, encoding, and the other robots of the same request",
+    "network": "the rest of the round trip: encoding, bus (in one process: none), other robots of the same request",
     "queue": "from the receipt of the request in the service to the start of the decision",
     "decide": "in the filter, including solve and verify",
     "solve": "quadratic programs, for decisions that solve one",

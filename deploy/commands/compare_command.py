@@ -226,7 +226,7 @@ class CompareCommand:
         for label in {compared(cell.method).label for cell in cells if compared(cell.method).learner == SAC_LEARNER}:
             if ignored:
                 say(robot, f"{label} has no {', '.join(ignored)}: it learns without")
-        own = [replace(cell, td3=learning(self.td3, cell.method, settings, self.given)) for cell in cells]
+        own = [replace(cell, td3=learning(self.td3, cell.method, cell.robot, settings, self.given)) for cell in cells]
         chosen = [replace(quick(cell, self.given) if self.quick else cell, **changed) for cell in own]
         conservatism = self.conservatism and not self.quick and TRAINED in stored_policies(described)
         return chosen, [Conservatism(robot, task=task_hash(robot))] if conservatism else []

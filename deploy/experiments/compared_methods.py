@@ -36,6 +36,7 @@ class ComparedMethod:
         source: where the method is from.
         learner: TD3 is our own; SAC is Stable-Baselines3's.
         td3: settings of the learner that differ from the others'.
+        tuned_on: robots, and settings that replace those of `td3` there, because a tuning on that robot found them.
         tuned: the setting that was tuned; empty: none.
         robots: on which it is compared. EVERY: all. BATCHES: those that batches simulate.
     """
@@ -47,8 +48,13 @@ class ComparedMethod:
     source: str
     learner: str = TD3_LEARNER
     td3: Mapping[str, Any] = field(default_factory=dict)
+    tuned_on: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     tuned: str = ""
     robots: str = EVERY
+
+    def learner_settings(self, robot: str) -> dict[str, Any]:
+        """Return the settings of the learner on a robot that differ from the other methods'."""
+        return {**self.td3, **self.tuned_on.get(robot, {})}
 
 
 METHODS: dict[str, ComparedMethod] = {
@@ -65,6 +71,7 @@ METHODS: dict[str, ComparedMethod] = {
     "lagrange": ComparedMethod(
         *("TD3-Lagrange", NONE, NOTHING, NOTHING, "Ray et al. 2019; Tessler et al. 2019"),
         td3={"cost_limit": 0.01, "multiplier_rate": 1.0},
+        tuned_on={"quadrotor": {"multiplier_rate": 0.1}},
         tuned="multiplier_rate",
         robots=BATCHES,
     ),
@@ -89,6 +96,7 @@ METHODS: dict[str, ComparedMethod] = {
         *("SAC, our filter", DDPC, MAP, "sets from recorded driving", "Haarnoja et al. 2018; Stable-Baselines3"),
         learner=SAC_LEARNER,
         td3={"actor_rate": 3e-3},  # of an earlier tuning, without the filter
+        tuned_on={"quadrotor": {"actor_rate": 3e-4}},  # of the tuning of SAC without the filter
         tuned="learning rate",
         robots=BATCHES,
     ),

@@ -133,10 +133,13 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     return "batch"
 
 
-def learning(td3: TD3Config, method: str, settings: Mapping[str, Any], given: Collection[str] = ()) -> TD3Config:
+def learning(
+    td3: TD3Config, method: str, robot: str, settings: Mapping[str, Any], given: Collection[str] = ()
+) -> TD3Config:
     """Return the learner's settings, with those of the method and of the robot's task in place of the defaults.
 
     Args:
+        robot: its name: a method may have settings that were tuned on it.
         settings: `Task.learner`, for TD3 behind a filter that replaces single inputs. SAILR ends an episode instead.
         given: names of settings that stay as they are in `td3`.
 
@@ -145,7 +148,7 @@ def learning(td3: TD3Config, method: str, settings: Mapping[str, Any], given: Co
     """
     row = compared(method)
     with_task = row.filter not in (NONE, SAILR) and row.learner == TD3_LEARNER
-    return td3.with_settings({**(settings if with_task else {}), **row.td3}, given)
+    return td3.with_settings({**(settings if with_task else {}), **row.learner_settings(robot)}, given)
 
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:

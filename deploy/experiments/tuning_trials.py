@@ -161,7 +161,7 @@ def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> 
         if method in SETTINGS:
             name, values = SETTINGS[method]
             (cell,) = cell_configs(robot, (method,), (SEED,), arenas[:1])
-            used = learning(TD3Config(), method, task.learner)
+            used = learning(TD3Config(), method, robot, task.learner)
             for value in values:
                 changed: dict[str, Any] = {name: value}
                 own = replace(cell, td3=replace(used, **changed), episodes=EPISODES)

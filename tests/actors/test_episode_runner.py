@@ -2,6 +2,8 @@
 the next answer it drives on. Where not even hovering can be verified, a vehicle stays on the ground.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -318,6 +320,16 @@ def test_no_takeoff_where_hovering_cannot_be_verified(flight_filter: Ask) -> Non
     assert takeoff_verified(flight_filter, IN_REAL_TIME, beside(2.0), True, lambda: False)
     with pytest.raises(TakeoffNotVerified, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
         takeoff_verified(flight_filter, IN_REAL_TIME, beside(0.02), True, lambda: False)
+
+    def braking(requests: Sequence[pb.Request]) -> list[pb.Reply]:
+        replies = flight_filter(requests)
+        for reply in replies:
+            reply.decision.kind, reply.decision.reason = pb.FAILSAFE, "no plan"
+        return replies
+
+    nothing_near = replace(hall(), obstacles=())
+    with pytest.raises(TakeoffNotVerified, match=r"hovering at the start can't be verified \(no plan\)"):
+        takeoff_verified(braking, IN_REAL_TIME, nothing_near, True, lambda: False)
     assert takeoff_verified(flight_filter, IN_REAL_TIME, beside(0.02), False, lambda: False), (
         "a rival cannot verify hovering"
     )

@@ -318,17 +318,20 @@ def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_no
     assert backend_for("ground", ("default", "walkers")) == backend_for("ground+tracks", ("default",)) == "single"
     task = robot_with_task("ground").task.learner
     given = replace(TD3Config(), updates_per_step=0.5)
-    assert learning(given, "none", task) == given and learning(TD3Config(), "none", task).updates_per_step == 1.0
-    assert given.cost_limit is None and learning(given, "lagrange", task).cost_limit is not None
+    assert (
+        learning(given, "none", "ground", task) == given
+        and learning(TD3Config(), "none", "ground", task).updates_per_step == 1.0
+    )
+    assert given.cost_limit is None and learning(given, "lagrange", "ground", task).cost_limit is not None
 
 
 def test_methods_whose_filter_replaces_inputs_have_the_learner_of_the_task():
     task = robot_with_task("quadrotor").task.learner
     assert task["imitation"] > 0.0
     for method in compared_methods.METHODS:
-        used = learning(TD3Config(), method, task)
+        used = learning(TD3Config(), method, "quadrotor", task)
         assert (used.imitation > 0.0) == (method in ("ddpc", "secas", "cbf", "psf")), method
-    assert learning(replace(TD3Config(), imitation=0.5), "ddpc", task).imitation == 0.5
+    assert learning(replace(TD3Config(), imitation=0.5), "ddpc", "quadrotor", task).imitation == 0.5
     for wanted in (True, False):
         (job,), _ = CompareCommand(
             ("quadrotor",), (0,), methods=("ddpc",), conservatism=False, task_settings=wanted
@@ -338,23 +341,24 @@ def test_methods_whose_filter_replaces_inputs_have_the_learner_of_the_task():
 
 def test_a_setting_that_an_option_gives_stays_also_with_its_default_value(monkeypatch):
     """The table of SAC says 0.0003 and 0.003, the quadrotor's task a penalty growth, and --quick a small batch."""
-    words = "compare quadrotor --seeds 0 --no-conservatism --quick --methods"
+    words = "--seeds 0 --no-conservatism --quick --methods"
     monkeypatch.setattr(compare_command, "import_module", lambda _: None)
     said = []
     monkeypatch.setattr(compare_command, "say", lambda *words: said.append(words))
-    for method, name, option, value in (
-        ("sac-ddpc", "actor_rate", "--td3.actor-rate=0.0003", 3e-4),
-        ("ddpc", "penalty_growth", "--td3.penalty-growth 1", 1.0),
-        ("ddpc", "batch", "--td3.batch 128", 128),
-        ("sac-ddpc", "imitation", "--td3.imitation 0", 0.0),
+    for robot, method, name, option, value in (
+        ("ground", "sac-ddpc", "actor_rate", "--td3.actor-rate=0.0003", 3e-4),
+        ("quadrotor", "ddpc", "penalty_growth", "--td3.penalty-growth 1", 1.0),
+        ("quadrotor", "ddpc", "batch", "--td3.batch 128", 128),
+        ("quadrotor", "lagrange", "multiplier_rate", "--td3.multiplier-rate 1", 1.0),
+        ("quadrotor", "sac-ddpc", "imitation", "--td3.imitation 0", 0.0),
     ):
-        plain, given = (parse("compare", f"{words} {method} {more}".split()[1:]) for more in ("", option))
-        ((usual,), _), ((chosen,), _) = (command._jobs("quadrotor") for command in (plain, given))
+        plain, given = (parse("compare", f"{robot} {words} {method} {more}".split()) for more in ("", option))
+        ((usual,), _), ((chosen,), _) = (command._jobs(robot) for command in (plain, given))
         assert getattr(chosen.td3, name) == value and (getattr(usual.td3, name) != value or name == "imitation")
     assert said == [("quadrotor", "SAC, our filter has no --td3.imitation: it learns without")]
     with pytest.raises(ValueError, match="--table ignores --td3: leave"):
         parse("compare", ["--table", "--td3.batch", "128"]).run()
-    assert learning(TD3Config(), "lagrange", {}, {"cost_limit"}).cost_limit is None
+    assert learning(TD3Config(), "lagrange", "ground", {}, {"cost_limit"}).cost_limit is None
 
 
 def test_a_penalty_out_of_proportion_for_any_robot_is_refused_before_the_first_training(monkeypatch):
