@@ -31,6 +31,7 @@ class BatchSafetyWrapper(VectorWrapper):
 
     `step` adds to `infos`: `outcome` (a `BatchOutcome`), `executed` (N, m), `penalty` (N,), and `compared` and
     `contained` (N,): whether the filter predicted the new state, and whether the state is in that set.
+    Gymnasium's `DictInfoToList` takes none of these infos, since `outcome` is not an array.
     """
 
     def __init__(

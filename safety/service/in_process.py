@@ -55,7 +55,7 @@ class InProcess:
             TypeError: `method` is neither.
             TooLoose: the report states a larger probability, or there is no report.
         """
-        if not hasattr(method, "decide"):
+        if not hasattr(method, "observed"):  # clients and fleets decide too, on other arguments
             raise TypeError(f"a filter is needed here, not a {type(method).__name__}: give Filter.load(NAME_OR_PATH)")
         from brakeline.safety.model.stated_bound import check_bound  # a client of a service loads no model
 

@@ -14,6 +14,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper
+from brakeline.safety.service.fleet_client import FleetClient
 from brakeline.safety.service.in_process import InProcess
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.navigation_env import NavigationEnv
@@ -69,6 +70,13 @@ def test_a_penalty_that_no_reward_has_is_refused(wrap: Wrap, penalty: float) -> 
 def test_only_a_filter_decides_for_many(wrap: Wrap, filter: Any) -> None:
     with pytest.raises(TypeError, match=r"a filter is needed here, not a (InProcess|str): give Filter\.load"):
         wrap(filter)
+
+
+@pytest.mark.parametrize("client", [InProcess(SAFETY), object.__new__(FleetClient), "ground"])
+def test_a_client_needs_a_method_not_another_client(client: Any) -> None:
+    """A wrapper took a fleet's client, and failed in the first step."""
+    with pytest.raises(TypeError, match=r"a filter is needed here, not a (InProcess|FleetClient|str)"):
+        InProcess(client)
 
 
 @pytest.mark.parametrize("wrap", [vector, batch])
