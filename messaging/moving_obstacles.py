@@ -31,7 +31,7 @@ class MovingObstacles(ComparedByValue):
         n = len(obstacles)
         motions = [obstacle.motion for obstacle in obstacles if obstacle.motion is not None]
         return MovingObstacles(
-            Shapes.of(obstacles, dim),
+            Shapes.at_present(obstacles, dim),
             np.array([m.drift() for m in motions], dtype=float).reshape(n, dim),
             np.array([m.growth() for m in motions], dtype=float).reshape(n, 3),
             np.array([m.age for m in motions], dtype=float),

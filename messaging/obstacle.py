@@ -139,11 +139,18 @@ class Shapes(ComparedByValue):
 
     @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
-        """Stack obstacles as they stand now. A motion is left out: `split_moving` separates obstacles that move.
+        """Stack obstacles that stand. `split_moving` separates them from those that move.
 
         Raises:
-            BadShape: an obstacle has another dimension than `dim`.
+            BadShape: an obstacle has another dimension than `dim`, or a motion, which the arrays cannot hold.
         """
+        if any(obstacle.motion is not None for obstacle in obstacles):
+            raise BadShape("motion", "these arrays hold no motion: separate obstacles that move by split_moving")
+        return Shapes.at_present(obstacles, dim)
+
+    @staticmethod
+    def at_present(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
+        """Stack obstacles where they are now, whether they move or not. Raises BadShape: one has another dimension."""
         n, flat = len(obstacles), dim == 2
         if n and not dim:
             raise BadShape("position", "a robot without a position has no obstacles, only limits")

@@ -55,7 +55,7 @@ def vector_to_nearest(info: dict[str, Any]) -> Array:
     position = info["state"][: arena.dim]
     vectors = arena.shapes.towards(position)
     if moving := [obstacle for obstacle in info["obstacles"] if obstacle.motion is not None]:
-        vectors = np.concatenate([vectors, Shapes.of(moving, arena.dim).towards(position)])
+        vectors = np.concatenate([vectors, Shapes.at_present(moving, arena.dim).towards(position)])
     if len(others := info.get("others", ())):
         vectors = np.concatenate([vectors, others[:, : arena.dim] - position])
     return np.asarray(vectors[np.argmin(np.einsum("ni,ni->n", vectors, vectors))])

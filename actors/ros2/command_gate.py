@@ -160,7 +160,7 @@ class CommandGate:
         assert outcome.answer is not None
         d = self.robot.position_dim
         positions = np.stack([state[:d], outcome.answer.tube_center[-1]])
-        now, end = Shapes.of(obstacles, d).distance(positions).min(axis=0)
+        now, end = Shapes.at_present(obstacles, d).distance(positions).min(axis=0)
         return bool(end < now)
 
 

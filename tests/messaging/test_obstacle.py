@@ -172,3 +172,11 @@ def test_an_obstacle_stays_where_it_was_when_its_owner_overwrites_an_array():
     kept = Sighting(tracked[:2], tracked[2:], since=0.2)
     tracked[:] = 0.0
     assert kept == Sighting((1.5, 0.0), (-0.4, 0.0), since=0.2)
+
+
+def test_arrays_of_standing_obstacles_refuse_one_that_moves():
+    """They left its motion out, so a request held a walker that stood."""
+    walker = Obstacle(CYLINDER, (1.0, 0.0), (0.2,), motion=Motion((-0.5, 0.0), 0.03, acceleration=1.0))
+    with pytest.raises(BadShape, match="split_moving"):
+        Shapes.of([walker], 2)
+    assert Shapes.at_present([walker], 2).distance(np.zeros(2)) == 0.8
