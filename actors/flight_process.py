@@ -104,14 +104,22 @@ class RealTimeVehicle:
     The true state is unknown here. The estimate takes its place, also for the rays of a virtual scan.
     """
 
-    def __init__(self, vehicle: VehicleClient, skip: Callable[[], object], executes: Callable[[Array], object]) -> None:
+    def __init__(
+        self,
+        vehicle: VehicleClient,
+        skip: Callable[[], object],
+        executes: Callable[[Array], object],
+        acceleration_age: float,
+    ) -> None:
         """Follow a vehicle in flight.
 
         Args:
             skip: called for each period that passed without an observation.
             executes: called with the input in force (3,) [m/s] of each period that was observed.
+            acceleration_age: see `FlightSettings`. The environment states it, and the runner's requests repeat it.
         """
         self.vehicle, self._skip, self._executes = vehicle, skip, executes
+        self.acceleration_age = acceleration_age
         self.current_period: ControlPeriod = vehicle.current_period  # the latest that the environment observed
         self.skipped = 0  # periods that passed without an observation
 
@@ -171,9 +179,8 @@ class FlightRunner(ActorRunner):
             stages: the arenas of the flight's episodes, one after the other; they differ in the goal.
             acceleration_age: see `FlightSettings`.
         """
-        self._stages, self._next_stages = stages, cycle(stages)
+        self._stages, self._next_stages, self._acceleration_age = stages, cycle(stages), acceleration_age
         super().__init__(process, settings, 0, self._environment(conditions), propose, continuous=True)
-        self.runner.backup_plan.acceleration_age = acceleration_age
         self._vehicle: RealTimeVehicle | None = None
         self._began_lost = False  # whether the state before the step did not count
         self.answers: Counter[str] = Counter()  # "in time", "late", "none", "lost" or "not needed"
@@ -188,7 +195,9 @@ class FlightRunner(ActorRunner):
 
     def take(self, vehicle: VehicleClient) -> None:
         """Fly this vehicle, which hovers, from now on. This does everything once that is slow the first time."""
-        self._vehicle = RealTimeVehicle(vehicle, self.runner.skip, self.runner.backup_plan.executes)
+        self._vehicle = RealTimeVehicle(
+            vehicle, self.runner.skip, self.runner.backup_plan.executes, self._acceleration_age
+        )
         observation, info = self.runner.env.reset(options={"episode_seed": 0})
         self.proposer.begin(np.random.default_rng(0))
         self.proposer.propose(observation, info)

@@ -10,13 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from brakeline.actors.actor_process import ActorSettings
 from brakeline.actors.decision_guard import DecisionOutcome
-from brakeline.actors.flight_process import FlightRunner, RealTimeVehicle
+from brakeline.actors.flight_process import BackgroundPublisher, FlightRunner, RealTimeVehicle
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.process_runtime import Process
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.sim.quadrotor import SAMPLES
+from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import Period
+from tests.arenas import staged_arena
 from tests.robots import QUADROTOR
 
 HELD = "the autopilot does not follow our setpoints (HOLD)"
@@ -38,6 +44,26 @@ def test_a_step_between_two_states_is_lost_if_one_of_them_is(before: str, after:
     assert (runner.runner.backup_plan.model == UNVERIFIED) == bool(before)
 
 
+def test_its_requests_state_the_age_of_the_acceleration_in_its_states() -> None:
+    """They stated 0 s, so the service refused every request of a flight whose model set needs 0.2 s."""
+    flown: Any = SimpleNamespace(
+        current_period=ControlPeriod(4, np.zeros(3), STANDING),
+        wait=lambda number: ControlPeriod(number, np.zeros(3), STANDING),
+    )
+    settings = ActorSettings(BusSettings(listen=(free_endpoint(),)), "quadrotor-late")
+    stage, publisher = staged_arena(start=(0.0, 0.0, 3.0), goal=(4.0, 0.0, 3.0), height=6.0), BackgroundPublisher()
+    with Process(settings.bus, settings.name) as process:
+        runner = FlightRunner(process, settings, [stage], lambda _: hover, publisher, Conditions(), 0.2)
+        runner.take(flown)
+        runner.runner.begin(0)
+        publisher.close()
+    assert runner.runner.request(np.zeros(3)).acceleration_age == 0.2
+
+
+def hover(observation: Any, info: Any) -> np.ndarray:
+    return np.zeros(3)
+
+
 @pytest.mark.parametrize("number", [5, 7])
 def test_a_plan_whose_input_the_vehicle_does_not_execute_is_not_verified(number: int) -> None:
     """Such as after a standstill of the vehicle server, whose slew limits the input that follows."""
@@ -45,7 +71,7 @@ def test_a_plan_whose_input_the_vehicle_does_not_execute_is_not_verified(number:
     rows = np.outer(0.5 * np.maximum(6.0 - np.arange(plan.robot.horizon), 0.0), [1.0, 0.0, 0.0])
     plan.accept(rows, "m", None, verified=True)
     flown: Any = SimpleNamespace(current_period=ControlPeriod(4, rows[0], STANDING))
-    vehicle = RealTimeVehicle(flown, plan.fallback, plan.executes)
+    vehicle = RealTimeVehicle(flown, plan.fallback, plan.executes, acceleration_age=0.0)
     flown.wait = lambda _: ControlPeriod(number, rows[number - 4], STANDING)
     vehicle.step(rows[1])
     assert plan.model == "m" and plan.next_input == pytest.approx(rows[number - 4])
