@@ -17,10 +17,11 @@ from brakeline.deploy.experiments.task_engine import Engine, Say, unsaid
 from brakeline.deploy.policy_loading import file_named, policy_named
 from brakeline.deploy.run.run_config import SEEDS
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.errors import BadModel
+from brakeline.errors import BadModel, Mismatch
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.log_analysis import perception_in
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.acceleration_age import acceleration_age_in
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import Model
 from brakeline.safety.model.model_config import DDPC, check_reservations
@@ -149,10 +150,22 @@ def _raising(ask: Ask, method: str) -> Ask:
 
 
 def model_of(robot: RobotWithTask, evaluation: Evaluation) -> Model | None:
-    """Return the model of an evaluation's method, or None for the method `none`. Raises what `method_for` raises."""
+    """Return the model of an evaluation's method, or None for the method `none`.
+
+    Raises:
+        Mismatch: the model set needs older accelerations than the simulator reports. Its robot would stand still.
+        BadModel, TooLoose: see `method_for`.
+    """
     if evaluation.method == "none":
         return None
-    return method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
+    model = method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
+    if (age := acceleration_age_in(model.about)) and not evaluation.conditions.learned:
+        raise Mismatch(
+            f"the model set of {robot.name} was recorded with the horizontal acceleration of {age:g} s ago, and the "
+            "simulator reports the present one: drive the model set itself (`brakeline evaluate --learned`), or the "
+            "real robot (`brakeline fly`)"
+        )
+    return model
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy import cli
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.data_paths import model_path
+from brakeline.deploy.experiments.evaluate import Evaluation, model_of
 from brakeline.deploy.learned_vehicle import LearnedMotion, LearnedVehicle
 from brakeline.deploy.vehicle_factory import empty_arena, environment
 from brakeline.errors import BadModel, Mismatch
@@ -143,6 +144,9 @@ def test_a_robot_in_real_time_has_a_model_set_of_its_own_and_answers_a_period_la
     runner = EpisodeRunner(late, env, ActorIdentity("actor-0", 0, 0))
     runner.begin(0)
     assert runner.request(np.zeros(2)).acceleration_age == 0.2, "the states hold what the data held"
+    with pytest.raises(Mismatch, match=r"of 0\.2 s ago, and the simulator reports the present one.*--learned"):
+        model_of(late, Evaluation(model_config=CONFIG, accept_bound=1.0))
+    assert model_of(late, Evaluation(model_config=CONFIG, accept_bound=1.0, conditions=LEARNED))
 
 
 def test_what_it_cannot_simulate_is_refused(capsys) -> None:
