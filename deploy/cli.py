@@ -232,9 +232,12 @@ def parse(name: str, arguments: list[str]) -> Any:
         unwrap_help(command)
         if hasattr(command, "expert") and words == arguments:
             command, description = abridged(command), f"{description}\n\nAll options: brakeline {name} --help-all"
+        read = ["--help"]  # tyro's help leaves out the positional arguments that come before
+    else:
+        read = words
     defaults = {"default": command.defaults(words)} if hasattr(command, "defaults") else {}
     return tyro.cli(
-        command, **defaults, prog=f"brakeline {name}", description=description, args=words, registry=registry
+        command, **defaults, prog=f"brakeline {name}", description=description, args=read, registry=registry
     )
 
 

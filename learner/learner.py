@@ -122,7 +122,9 @@ class Learner:
             raise
 
     def _weigh_penalties(self) -> None:
-        self._td3.penalty_factor = self.config.td3.penalty_factor(self.steps / self.config.steps)
+        """Let penalties grow with the share of the training, and never fall: a resumed one may have more steps."""
+        factor = self.config.td3.penalty_factor(self.steps / self.config.steps)
+        self._td3.penalty_factor = max(self._td3.penalty_factor, factor)
 
     def join(self, join: pb.Join, asker: str = "") -> pb.JoinReply:
         """Accept an actor, or give the reason for the refusal in `error`.
@@ -345,6 +347,7 @@ class Learner:
             "published_updates": self._published_updates,
             "episode_ended": self._episode_ended,
             "saved_at": self._saved_at,
+            "penalty_factor": self._td3.penalty_factor,
         }
         return PartState({}, values)
 
@@ -352,4 +355,5 @@ class Learner:
         self._draws.bit_generator.state = state.value("draws")
         self._version, self._published_updates = state.integer("version"), state.integer("published_updates")
         self._episode_ended, self._saved_at = bool(state.value("episode_ended")), state.integer("saved_at")
+        self._td3.penalty_factor = float(state.values.get("penalty_factor", 1.0))  # an earlier version saved none
         self._mark = (self._clock(), self.steps, self.updates)

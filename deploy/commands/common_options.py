@@ -327,10 +327,19 @@ def default_keys() -> Path | None:
 
 
 def bus_of(run: Path) -> BusSettings:
-    """Return the settings with which a client joins the bus of a run on this machine. Raises ValueError."""
-    from brakeline.deploy.run.processes import client_settings
+    """Return the settings with which a client joins the bus of a run on this machine.
 
+    Raises:
+        ValueError: there is no run, or it has ended.
+    """
+    from brakeline.deploy.run.processes import client_settings
+    from brakeline.messaging.free_ports import closed
+
+    advice = "give --connect tls/HOST:PORT, or start `brakeline train`"
     try:
-        return client_settings(run)
+        settings = client_settings(run)
     except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"no run at {run}: give --connect tls/HOST:PORT, or start `brakeline train`") from error
+        raise ValueError(f"no run at {run}: {advice}") from error
+    if closed(settings.connect[0]):
+        raise ValueError(f"the run at {run} ({run.resolve().name}) has ended: {advice}")
+    return settings

@@ -31,12 +31,29 @@ from brakeline.deploy.run.processes import (
     process_specs,
 )
 from brakeline.deploy.run.run_config import BATCH, RunConfig, load
-from brakeline.errors import BusError, CommandLost, Diverged
+from brakeline.errors import (
+    BadKeys,
+    BadModel,
+    BusError,
+    CommandLost,
+    Diverged,
+    Mismatch,
+    MissingExtra,
+    NoBatch,
+    NoFleet,
+    UnknownName,
+    UnknownRobot,
+    UnknownTask,
+)
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
 PRACTICE = 0.01  # of a run that certifies anew: a model set needs stops
-
+# What a process meets again after a restart: mistakes in the run's configuration, robots, tasks and model sets.
+LASTING = (
+    *(CommandLost, Diverged, UnknownRobot, UnknownTask, UnknownName, Mismatch, NoFleet, NoBatch, BadModel, BadKeys),
+    MissingExtra,
+)
 
 Work = Callable[[], bool | None]  # returns True when it is done. Otherwise a signal ended it
 
@@ -175,9 +192,10 @@ def main() -> int:
         if held:
             sys.stdin.read()
         done = work()
-    except (BusError, CommandLost, Diverged) as error:
-        print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
-        return 1 if isinstance(error, BusError) else HOPELESS
+    except (BusError, *LASTING) as error:
+        # In one line: the launcher shows the last one.
+        print(f"{name}: {type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
+        return HOPELESS if isinstance(error, LASTING) else 1
     return 0 if done else UNFINISHED
 
 

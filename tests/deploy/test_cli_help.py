@@ -27,6 +27,13 @@ def test_help_shows_the_example_and_ends_with_0(command, name):
     assert f"Example: {COMMANDS[name].example}" in " ".join(out.split())
 
 
+@pytest.mark.parametrize("words", ["robot new", "query ground", "keys keys safety", "train quadrotor"])
+def test_help_after_positional_arguments_is_the_help_of_the_command(command, words):
+    assert (
+        command(*words.split(), "--help")[1].splitlines()[0] == command(words.split()[0], "--help")[1].splitlines()[0]
+    )
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_example_is_understood(name, monkeypatch):
     understood = []

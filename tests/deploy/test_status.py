@@ -3,6 +3,9 @@
 import json
 import threading
 
+import pytest
+
+from brakeline.deploy.run.processes import write_endpoint
 from brakeline.logs.watch.run_history import NOTE
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -31,3 +34,15 @@ def test_the_table_and_the_json_leave_out_the_curves_of_the_live_page(command, f
     assert status == 0 and "pid 7, run first" in table
     assert max(map(len, table.splitlines())) < 100
     assert shown["processes"]["launcher"] == {"pid": 7, "run": "first"}
+
+
+@pytest.mark.parametrize("words", ["status", "query ground --known-free", "watch --port 0"])
+def test_a_run_that_has_ended_is_named_at_once(command, tmp_path, monkeypatch, words) -> None:
+    """Before, the error after ten seconds named an endpoint that nobody had given."""
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "first"
+    run.mkdir(parents=True)
+    write_endpoint(run, BusSettings(listen=(free_endpoint(),)))
+    (run.parent / "latest").symlink_to(run.name)
+    status, out, err = command(*words.split())
+    assert (status, out) == (1, "") and "the run at runs/latest (first) has ended: give --connect" in err

@@ -97,6 +97,23 @@ def test_penalties_grow_during_the_training_also_those_of_old_steps():
     assert factors == pytest.approx([1.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0, 3.0])
 
 
+def test_penalties_do_not_fall_when_a_resumed_training_gets_more_steps(tmp_path):
+    config = replace(CONFIG, lockstep=False, td3=replace(CONFIG.td3, penalty_growth=3.0))
+    learner, _ = started(replace(config, steps=12))
+    for index in range(1, 6):
+        learner.insert(step(index))
+    learner.save(tmp_path)
+    resumed = Learner(TOY, replace(config, steps=24), incarnation=1)
+    resumed.restore(tmp_path)
+    assert resumed._td3.penalty_factor == learner._td3.penalty_factor == pytest.approx(2.5)
+    resumed.join(joining("actor-0", index=5))
+    factors = []
+    for index in range(6, 13):
+        resumed.insert(step(index))
+        factors.append(resumed._td3.penalty_factor)
+    assert factors == pytest.approx([2.5, 2.5, 2.5, 2.5, 2.5, 2.75, 3.0])
+
+
 def test_duplicates_and_gaps_are_counted():
     learner, _ = started()
     assert [learner.insert(step(index)) for index in (1, 2, 2, 5, 1)] == [True, True, False, True, False]

@@ -18,7 +18,7 @@ from brakeline.deploy.run.supervisor import (
     describe_end,
     last_line,
 )
-from brakeline.errors import CommandLost, LaunchError
+from brakeline.errors import BadDescription, BadKeys, CommandLost, LaunchError, Mismatch
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.process_runtime import MAX_SILENCE
 
@@ -182,14 +182,28 @@ def test_a_process_that_a_signal_without_a_name_has_killed_does_not_end_the_laun
     assert describe_end(-40, 1.0) == "was killed by signal 40 after 1.0 s"
 
 
-def test_an_actor_whose_command_of_its_vehicle_ended_is_not_started_again(tmp_path, monkeypatch, capsys) -> None:
-    """It would arm a vehicle that a person may have in hand, and take off."""
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (CommandLost("our command of the vehicle has ended"), "CommandLost: our command of the vehicle has ended"),
+        (
+            BadDescription("my.toml", [("period", "must be positive"), ("body", "is missing")]),
+            "BadDescription: my.toml is no robot's description: period: must be positive body: is missing",
+        ),
+        (Mismatch("the simulated ground has a larger body"), "Mismatch: the simulated ground has a larger body"),
+        (BadKeys("the key is too short"), "BadKeys: the key is too short"),
+    ],
+)
+def test_a_process_is_not_started_again_after_an_error_that_it_would_meet_again(
+    error, said, tmp_path, monkeypatch, capsys
+) -> None:
+    """An actor that lost its command of a vehicle would also arm one that a person may have in hand, and take off."""
 
-    def fly() -> bool:
-        raise CommandLost("our command of the vehicle has ended: it has disarmed")
+    def drive() -> bool:
+        raise error
 
     spec = ProcessSpec("actor-0", "actor")
-    monkeypatch.setattr(run_process, "PROCESSES", {"actor": lambda *_: fly})
+    monkeypatch.setattr(run_process, "PROCESSES", {"actor": lambda *_: drive})
     for name, result in (
         ("load", None),
         ("process_specs", [spec]),
@@ -202,4 +216,4 @@ def test_an_actor_whose_command_of_its_vehicle_ended_is_not_started_again(tmp_pa
     monkeypatch.setattr(run_process.signal, "signal", lambda *_: None)
     monkeypatch.setattr("sys.argv", ["run_process", str(tmp_path), spec.name])
     assert run_process.main() == HOPELESS
-    assert capsys.readouterr().err == "actor-0: CommandLost: our command of the vehicle has ended: it has disarmed\n"
+    assert capsys.readouterr().err == f"actor-0: {said}\n"
