@@ -135,7 +135,11 @@ def _state_problems(model: DescriptionModel) -> Iterator[Problem]:
     if "heading" in roles and d == 3:
         yield "state", "a heading belongs to a robot in the plane"
     if "other" not in roles:
-        yield "state", "besides the pose, a speed or another coordinate that determines the next step is needed"
+        yield (
+            "state",
+            "besides the pose, a speed or another coordinate that determines the next step is needed; if the inputs "
+            "are the speeds, log those of the period before",
+        )
     for name, c in model.state.items():
         if c.unit != UNIT_OF_ROLE.get(c.role, c.unit):
             yield f"state.{name}.unit", f"a {c.role} is in {UNIT_OF_ROLE[c.role]}, not {c.unit!r}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -54,8 +55,8 @@ class ReplayCommand:
         if other_model:
             changes["mode"] = self.mode
         replacement = self._replacement() if other_model else None
-        counts = (count_by_key(path) for path in find(self.logs))
-        total = sum(n for count in counts for key, n in count.items() if key.startswith("exchange/"))
+        logged = sum((count_by_key(path) for path in find(self.logs)), Counter[str]())
+        total, steps = (sum(logged[key] for key in logged if key.startswith(kind)) for kind in ("exchange/", "step/"))
         # The warnings of the filter were about the robots of that time.
         with under_way("deciding each request again", total) as advance, errors_only("brakeline.safety"):
             result = replay(list(self.logs), replacement, advance, self.margin)
@@ -66,7 +67,8 @@ class ReplayCommand:
             print_comparison(figures)
         print_damage(result.damage)
         if not result.requests:
-            errors.print("nothing was compared: no request could be read")
+            why = "the log of a batch holds steps, but no requests" if steps else "no request could be read"
+            errors.print(f"nothing was compared: {why}")
             return DIFFERENT
         return DIFFERENT if result.different and not changes else 0
 

@@ -19,7 +19,11 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.run.replay_run import APART, Difference, differences, replay
 from brakeline.errors import LogError
 from brakeline.logs.reader import open_log
+from brakeline.logs.recorder import entry
+from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.topics import STEP
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.wire import decision_reply, request_of
@@ -140,6 +144,16 @@ def test_a_replay_says_what_it_could_not_read(damaged: Path, tmp_path: Path, com
     (tmp_path / "empty.mcap").touch()
     status, _, err = command("replay", tmp_path / "empty.mcap")
     assert status == 1 and "no request could be read" in err
+
+
+def test_a_replay_says_that_the_log_of_a_batch_holds_no_requests(tmp_path: Path, command) -> None:
+    segment = open_segment(tmp_path / "run.mcap", {"run": {"method": "ddpc"}}, None)
+    step = pb.Step(header=pb.Header(sequence=1, source="actor-0", run=1, wall_time=1), robot="ground", actor="actor-0")
+    key = STEP.at(robot="ground", source="actor-0")
+    segment.save([entry(Sample(STEP, key, step.SerializeToString(), 1))])
+    segment.finish()
+    status, _, err = command("replay", tmp_path)
+    assert status == 1 and "the log of a batch holds steps, but no requests" in err
 
 
 def test_a_replay_says_which_requests_of_a_fleet_it_could_not_decide_again(data_folder: Path, tmp_path: Path) -> None:
