@@ -8,19 +8,24 @@ from brakeline.messaging.robot import Array
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.request import Request
+from brakeline.safety.model.model_set import extra_coordinates
 
 
 def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array) -> bool:
     """Return whether the robot stands and its plan is to stand. No model set needs to verify that.
 
     The first request of a program may be about a robot that drives already. Nothing was predicted of it. So the model
-    set must not predict that it leaves its place.
+    set must not predict that it leaves its place: in joint space, that a coordinate with a limit changes.
 
     Args:
         z: regressors of the plan.
     """
     robot = constraints.robot
-    if not request.still(robot) or request.predicted is not None or not robot.position_dim:
+    if not request.still(robot) or request.predicted is not None:
         return request.still(robot)
-    centers, half = constraints.sets(local_map.start, local_map.turn, z)
-    return bool((np.abs(centers - local_map.start) <= half + constraints.measurement_error).all())
+    if robot.position_dim:
+        centers, half = constraints.sets(local_map.start, local_map.turn, z)
+        return bool((np.abs(centers - local_map.start) <= half + constraints.measurement_error).all())
+    limited, tube = list(extra_coordinates(robot)), constraints.tube
+    half = constraints.widening * tube.more_half_widths(z) + np.asarray(robot.measurement_bound)[limited]
+    return bool((np.abs(tube.more_offset - request.state[limited]) <= half).all())
