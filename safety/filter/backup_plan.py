@@ -218,9 +218,8 @@ class BackupPlan:
         self.plan = np.vstack([self.plan[1:], last[None]])
         self.input_in_force = now
         self._still = self._still + 1 if rests else 0
-        stopped = self.model != UNVERIFIED or self._still >= robot.horizon
-        if stopped and rests and robot.is_stop_input(self.plan).all():
-            self.model = ""  # a standing robot needs no model set
+        if self._still >= robot.horizon and robot.is_stop_input(self.plan).all():
+            self.model = ""  # it has coasted to a stand, and a standing robot needs no model set
         return self.next_input
 
 

@@ -8,6 +8,7 @@ from brakeline.messaging.robot import Array
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.request import Request
+from brakeline.safety.model.model_set import extra_coordinates
 
 
 def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array) -> bool:
@@ -15,12 +16,18 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
 
     The first request of a program contains no prediction, and the robot may be driving already. Then the robot counts
     as standing only if the sets of its plan contain its present position in every period, up to the measurement error.
+    In joint space, this is about the coordinates that have a limit.
+
 
     Args:
         z: regressors of the plan.
     """
     robot = constraints.robot
-    if not request.still(robot) or request.predicted is not None or not robot.position_dim:
+    if not request.still(robot) or request.predicted is not None:
         return request.still(robot)
-    centers, half = constraints.sets(local_map.start, local_map.turn, z)
-    return bool((np.abs(centers - local_map.start) <= half + constraints.measurement_error).all())
+    if robot.position_dim:
+        centers, half = constraints.sets(local_map.start, local_map.turn, z)
+        return bool((np.abs(centers - local_map.start) <= half + constraints.measurement_error).all())
+    limited, tube = list(extra_coordinates(robot)), constraints.tube
+    half = constraints.widening * tube.more_half_widths(z) + np.asarray(robot.measurement_bound)[limited]
+    return bool((np.abs(tube.more_offset - request.state[limited]) <= half).all())

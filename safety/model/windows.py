@@ -266,7 +266,8 @@ def resting_periods_at_end(robot: Robot) -> int:
 def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
     """Return the number of periods after which the robot stood in every recorded plan, and went on standing.
 
-    The robot stands if every measured speed is within its measurement error of zero.
+    The robot stands if every measured speed is within its measurement error of zero, and its pose is that of the plan's
+    end, within the errors of both measurements. A description need not name every speed.
 
     Args:
         whole: windows over all periods of a plan.
@@ -276,15 +277,18 @@ def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
     Returns:
         A number of periods. It is the horizon for `FREE` windows, and if the robot still moved at a plan's last period.
     """
-    robot = data.robot
-    speeds, none = list(robot.regressor), np.asarray(robot.measurement_bound)[list(robot.regressor)]
+    robot, N, heading = data.robot, data.robot.horizon, data.robot.heading
     if kind != PLAN:
-        return robot.horizon
-    for k in range(robot.horizon, 0, -1):
-        after = np.array([data.trajectories[number].states[start + k, speeds] for number, start in whole.start])
-        if not (np.abs(after) <= none).all():
-            return min(k + 1, robot.horizon)
-    return 1
+        return N
+    error = np.asarray(robot.measurement_bound)
+    plans = np.array([data.trajectories[number].states[start : start + N + 1] for number, start in whole.start])
+    left = plans - plans[:, -1:]  # the way to the plan's end
+    speeds, pose = list(robot.regressor), list(range(robot.position_dim))
+    if heading is not None:
+        left[..., heading] = (left[..., heading] + np.pi) % (2.0 * np.pi) - np.pi
+        pose.append(heading)
+    moves = (np.abs(plans[..., speeds]) > error[speeds]).any(2) | (np.abs(left[..., pose]) > 2.0 * error[pose]).any(2)
+    return min(int(np.flatnonzero(moves.any(0)).max(initial=0)) + 1, N)
 
 
 def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:

@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan, Prediction
+from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord
 from brakeline.safety.filter.request import ALLOWED, FAILSAFE
+from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND
 from tests.safety.asked import STILL, cylinder, request
 from tests.safety.toys import puck
@@ -71,13 +75,14 @@ def test_standing_still_needs_no_token(ready):
     assert decision.kind == FAILSAFE and decision.verified and not decision.plan.any()
 
 
-def test_an_unverified_plan_stays_unverified_until_the_robot_stands():
+def test_a_plan_counts_until_the_robot_stands():
     backup_plan, turning = BackupPlan(GROUND), np.array([[0.2, 0.1], [0, 0], [0, 0]])
     assert backup_plan.model == ""
     backup_plan.accept(turning, "v1", None, True)
     assert backup_plan.model == "v1" and np.array_equal(backup_plan.input_in_force, [0.2, 0.1])
-    backup_plan.fallback()
-    assert backup_plan.model == "", "it stands on a verified plan"
+    for model in ("v1", "v1", ""):  # it may coast until the plan ends
+        backup_plan.fallback()
+        assert backup_plan.model == model
     backup_plan.accept(turning, "v1", None, True)
     for _ in range(2):
         backup_plan.accept(STILL, "v1", None, False)
@@ -89,6 +94,25 @@ def test_an_unverified_plan_stays_unverified_until_the_robot_stands():
     assert backup_plan.model == "v2"
     backup_plan.reset()
     assert (backup_plan.model, backup_plan.predicted) == ("", None)
+
+
+@pytest.mark.parametrize("cause", ["another model set", "a broken bound"])
+def test_a_robot_that_coasts_does_not_stand(cause):
+    """Its inputs are zero already. It flies at 1 m/s, 0.3 m before an obstacle that the plan did not know."""
+    filter = Filter.load("quadrotor")
+    robot, client = filter.robot, InProcess(filter)
+    flying = np.array([0.0, 0.0, 0.0, 1.0, *np.zeros(5)])
+    verified_by = filter.version if cause == "a broken bound" else "0123456789ab"
+    plan, expected = np.zeros((robot.horizon, 3)), Prediction(flying, np.ones(9), 0.0)
+    plan[0, 0] = 0.1
+    client.backup_plan.accept(plan, verified_by, expected, True)
+    client.backup_plan.accept(np.zeros_like(plan), verified_by, expected, True)
+    elsewhere = Sighting(position=(9.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), since=0.2)
+    jumped = Motion((0.0, 0.0, 0.0), position_error=0.0, acceleration=0.0, before=elsewhere)
+    motion = jumped if cause == "a broken bound" else None
+    ball = Obstacle("sphere", (robot.footprint + 0.8, 0.0, 0.0), (0.5,), motion=motion)
+    answer = client.decide(flying, np.full(3, np.nan), [ball])
+    assert (answer.kind, answer.verified, answer.contained) == (FAILSAFE, False, True)
 
 
 def test_predictions_are_boxes_in_their_own_frame():

@@ -215,6 +215,20 @@ def test_the_widening_follows_a_weak_motor_and_keeps_the_limits():
     assert factors[0] == 1.0 and factors[-1] > 1.5 and answer.score is not None
 
 
+def test_an_arm_that_moves_when_its_program_begins_has_no_verified_plan_to_stand():
+    """Its first request names no plan, as that of a standing arm does."""
+    filter, blind = ready(), np.array([np.nan, 0.0])
+    bound, plan = np.array(filter.robot.measurement_bound), np.zeros((filter.robot.horizon, 2))
+    first = Request(np.array([0.99, 0.0, 1.0, 0.0]), blind, plan[0], plan, Shapes.of([], 0))
+    for state in (first.state, -first.state, np.array([0.0, 0.0, 5.0, 0.0])):  # the last one was never recorded
+        decision = filter.decide(replace(first, state=state))
+        assert (decision.kind, decision.verified) == (FAILSAFE, False)
+    standing = np.array([0.99, 0.0, 0.0, 0.0])
+    for state in standing + np.random.default_rng(0).uniform(-bound, bound, (50, 4)):  # as it may be measured
+        decision = filter.decide(replace(first, state=state))
+        assert (decision.kind, decision.verified) == (FAILSAFE, True)
+
+
 def test_an_arm_that_stands_beyond_a_limit_recovers():
     arm, client, kinds = Joints(joints(2), np.random.default_rng(6)), safety(), []
     arm.reset(np.array([1.1, 0.0]))

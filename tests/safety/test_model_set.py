@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from brakeline.errors import BadData, BadModel, BadTensors, ErrorBoundError
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import least_squares
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_config import DIRECT, KINDS, MODES, ModelConfig
@@ -18,7 +19,8 @@ from brakeline.safety.model.model_set import ENTRY, ModelSet
 from brakeline.safety.model.tensor_file import content, has_entry, pack, unpack
 from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import periods_until_standing, windows
-from tests.safety.unicycle import record
+from tests.robots import GROUND
+from tests.safety.unicycle import Unicycle, record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]
 
@@ -99,6 +101,15 @@ def test_the_version_names_the_content(models, model, data):
     assert wider.version != model.version
     assert replace(model, about={"note": "another"}).version == model.version
     assert replace(model, model_config=replace(model.model_config, mode="recursion")).version != model.version
+
+
+def test_a_robot_without_a_measured_speed_stands_once_its_pose_stays():
+    """Its log has a gyro and poses. It brakes straight ahead, so the gyro shows no motion."""
+    robot = replace(GROUND, regressor=(4,), stop=((0.5, 0.0), "ramp"))
+    plan = np.array([[0.25, 0.0], [0.125, 0.0], [0.0, 0.0]])
+    drives = [Unicycle((0.0, 0.0, a), np.random.default_rng(a), noise=0.0).trajectory([*plan] * 5) for a in range(8)]
+    data = Dataset(robot, tuple(drives))
+    assert periods_until_standing(windows(data, robot.horizon), data, "plan") == 2
 
 
 def test_the_time_until_a_robot_stands_comes_from_the_data(model, data, plans):

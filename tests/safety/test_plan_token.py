@@ -100,13 +100,15 @@ def test_each_period_has_its_token_until_the_robot_stands(robot: Robot) -> None:
         decision.plan_tokens.extend(authenticator.plan_tokens(request, decision, robot))
         wire = pb.Decision.FromString(decision.SerializeToString())
         accept(backup_plan, Answer.of(decision_of(wire, robot), robot, plan_tokens=tuple(wire.plan_tokens)))
-        for _ in range(robot.horizon + 2):
+        stopped = robot.horizon  # periods of a stop's inputs
+        for _ in range(2 * robot.horizon + 2):
+            stopped = 0 if np.any(backup_plan.input_in_force) else stopped + 1
             predicted = backup_plan.predicted
             state = np.zeros(robot.state_dim) if predicted is None else predicted.center
             message = request_message(backup_plan, state, plan[0], known_free=True, actor="a")
             message = pb.Request.FromString(message.SerializeToString())
             assert authenticator.is_authentic(message, robot)
-            moving = bool(np.any(backup_plan.plan) or np.any(backup_plan.input_in_force))
+            moving = bool(np.any(backup_plan.plan)) or stopped < robot.horizon
             assert bool(message.model) == moving and len(message.plan_token) == SIZE
             backup_plan.fallback()
 

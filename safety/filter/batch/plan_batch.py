@@ -228,8 +228,8 @@ class BackupPlanBatch:
         self.plan = np.concatenate([self.plan[:, 1:], last[:, None]], axis=1)
         self.input_in_force = now
         self._still = np.where(rests, self._still + 1, 0)
-        stopped = (self._status != OPEN) | (self._still >= robot.horizon)
-        self._status[stopped & rests & robot.is_stop_input(self.plan).all(axis=1)] = STANDING
+        stopped = self._still >= robot.horizon
+        self._status[stopped & robot.is_stop_input(self.plan).all(axis=1)] = STANDING
         return now.copy()
 
 
