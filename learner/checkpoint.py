@@ -30,6 +30,7 @@ from brakeline.messaging.structured_text import parse_json
 
 FORMAT = 2
 CHECKPOINT = "checkpoint"  # the folder of a run's checkpoints
+NOT_SAVED = "not saved"  # the note of a learner with the reason why its policy's file is not of the latest weights
 LATEST = "latest"
 MANIFEST = "manifest.json"
 MANIFEST_HASH = "manifest.sha256"

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from brakeline.errors import CheckpointError
-from brakeline.learner.checkpoint import CHECKPOINT
+from brakeline.learner.checkpoint import CHECKPOINT, NOT_SAVED
 from brakeline.learner.learner import Learner
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.policy_weights import POLICY
@@ -54,7 +54,9 @@ class LearnerOutput:
         path = self._out / POLICY
         try:
             write_atomically(path, self._learner.weights().file)
+            self._process.notes.pop(NOT_SAVED, None)
         except OSError as error:
+            self._process.notes[NOT_SAVED] = f"{path}: {error}"
             log.error("the policy was not written: %s", error)
 
     def hurry(self) -> None:

@@ -177,7 +177,7 @@ def train(
     With `verbose` it prints all figures at the end, not only the verdict. With `watch` it serves a live page, which
     `browser` opens.
 
-    Returns the exit status: 0, or STOPPED if the run was stopped before its last step.
+    Returns the exit status: 0, STOPPED if the run was stopped before its last step, or 1 if a policy was not saved.
     """
     shown = errors if as_json else console
     summary_line = f"{', '.join(config.robots)}, method {config.method}, arena {config.arena}, {config.steps} steps"
@@ -185,6 +185,7 @@ def train(
         from brakeline.deploy.run.display import Display, summary
         from brakeline.deploy.run.launcher import Launcher, prepare
         from brakeline.deploy.run.live_page import LivePage
+        from brakeline.deploy.run.verdict import not_saved
 
     config = prepare(config, folder, resume)
     if resume:
@@ -199,7 +200,7 @@ def train(
             summary(console, figures, verbose)
         if page is not None:
             page.stay(shown.print)
-    return 0 if figures["finished"] else STOPPED
+    return STOPPED if not figures["finished"] else int(bool(not_saved(figures)))
 
 
 def dated_folder() -> Path:

@@ -6,6 +6,7 @@ from collections import defaultdict, deque
 from shlex import quote
 from typing import Any
 
+from brakeline.learner.checkpoint import NOT_SAVED
 from brakeline.messaging import brakeline_pb2 as pb
 
 LATEST = 100  # episodes
@@ -45,11 +46,25 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     if refused := figures.get("refused"):
         lines.append(f"{refused} steps do not count: repeated, or not permitted by the learner")
     lines += _untrained(figures)
+    lines += [f"THE POLICY WAS NOT SAVED: {reason}. {_to_save(figures)}" for reason in not_saved(figures)]
     if not figures["finished"] and figures.get("policy") in (None, "learning"):
         lines.append(
             f"stopped before the last step; continue with: brakeline train --resume {quote(figures['folder'])}"
         )
     return lines
+
+
+def not_saved(figures: dict[str, Any]) -> list[str]:
+    """Return for each learner whose last policy was not written the reason, which names the file."""
+    return [one["notes"][NOT_SAVED] for one in figures["processes"].values() if one["notes"].get(NOT_SAVED)]
+
+
+def _to_save(figures: dict[str, Any]) -> str:
+    folder = quote(figures["folder"])
+    return (
+        "A file that is there is of earlier weights. Free some space, and learn again from the last checkpoint: "
+        f"brakeline train --resume {folder} (if there is none, add --from-logs {folder})"
+    )
 
 
 def _untrained(figures: dict[str, Any]) -> list[str]:

@@ -1,15 +1,18 @@
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from brakeline.errors import CheckpointError, DamagedPart, Diverged
-from brakeline.learner.checkpoint import PartState
+from brakeline.learner.checkpoint import NOT_SAVED, PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
+from brakeline.learner.learner_output import LearnerOutput
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights
+from tests.full_disk import full_disk
 from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle
 
 
@@ -112,6 +115,17 @@ def test_penalties_do_not_fall_when_a_resumed_training_gets_more_steps(tmp_path)
         resumed.insert(step(index))
         factors.append(resumed._td3.penalty_factor)
     assert factors == pytest.approx([2.5, 2.5, 2.5, 2.5, 2.5, 2.75, 3.0])
+
+
+def test_a_policy_that_a_full_disk_does_not_take_is_noted_until_it_is_saved(tmp_path):
+    learner, _ = started()
+    process = SimpleNamespace(notes={}, bus=SimpleNamespace(publisher=lambda *_, **__: None))
+    output = LearnerOutput(process, learner, tmp_path)
+    with full_disk(100):
+        output.save()
+    assert str(tmp_path / "policy.safetensors") in process.notes[NOT_SAVED] and not [*tmp_path.glob("policy*")]
+    output.save()
+    assert NOT_SAVED not in process.notes and (tmp_path / "policy.safetensors").exists()
 
 
 def test_duplicates_and_gaps_are_counted():

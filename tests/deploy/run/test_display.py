@@ -11,6 +11,8 @@ from brakeline.deploy.commands import command_output
 from brakeline.deploy.run.display import Display, line, live, run_phase, summary
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.run_config import RunConfig
+from brakeline.deploy.run.verdict import not_saved
+from brakeline.learner.checkpoint import NOT_SAVED
 from brakeline.logs.metrics import Metrics
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings
@@ -129,6 +131,18 @@ def test_a_resumed_run_and_an_untrained_policy_are_named_as_such(view: Launcher)
     assert untrained.startswith("the policy of ground has learned nothing: the run ended within the warm-up")
     stopped = figures | {"learners": {"ground": learner}, "finished": False}
     assert not any("learned nothing" in row for row in rows_of(stopped))
+
+
+def test_a_policy_that_was_not_saved_is_named_with_what_to_do(view: Launcher) -> None:
+    """Before, the run ended as if its policy were there; on a full disk, the file was an earlier one."""
+    health = pb.Health(process="learner", notes={NOT_SAVED: "/disk/policy.safetensors: No space left on device"})
+    health.header.sequence, health.header.run = 1, 7
+    view.metrics.add("health/learner", health)
+    figures = ended(view, finished=True, folder="/disk/my run")
+    (row,) = [row for row in rows_of(figures) if "NOT SAVED" in row]
+    assert row.startswith("THE POLICY WAS NOT SAVED: /disk/policy.safetensors: No space left on device. A file that")
+    assert "Free some space" in row and "brakeline train --resume '/disk/my run'" in row
+    assert not_saved(figures) and not not_saved(ended(view) | {"processes": {}})
 
 
 def test_two_kinds_of_robots_and_no_episode(view: Launcher) -> None:
