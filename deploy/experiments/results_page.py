@@ -123,6 +123,8 @@ def _setup(robot: RobotWithTask, robot_results: RobotResults) -> str:
     errors = ", ".join(f"{name}: {most:g}" for name, most in zip(robot.state, robot.measurement_bound, strict=True))
     arenas = "; ".join(f"`{arena}`: {_arena(task.arenas[arena])}" for arena in robot_results.arenas)
     note = version_note(cells_by_version(cell for cells in robot_results.cells.values() for cell in cells))
+    learners = [cells[0]["study"]["td3"] for cells in robot_results.cells.values()]
+    differing = [name for name in LEARNER if any(other.get(name) != td3.get(name) for other in learners)]
     rewards = {name: value for name, value in asdict(task.reward).items() if name != "correction_penalty"}
     rows = [
         ("inputs", low_high),
@@ -137,19 +139,25 @@ def _setup(robot: RobotWithTask, robot_results: RobotResults) -> str:
             f"{study['steps']:,} steps in `{first}`, "
             + (f"{study['robots']} robots at once" if batch else "one robot"),
         ),
-        ("all learners", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
-        *_own_settings(robot, robot_results),
+        ("all learners", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3 and name not in differing)),
+        *_own_settings(robot, robot_results, differing),
         *([("versions", note)] if note else []),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
     return "\n".join([*markdown_table(["", ""], rows), ""])
 
 
-def _own_settings(robot: RobotWithTask, robot_results: RobotResults) -> list[tuple[str, str]]:
-    """Return the settings in which the learners of the methods may differ, a row for each set of them."""
+def _own_settings(robot: RobotWithTask, robot_results: RobotResults, differing: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the settings in which the learners of the methods may differ, a row for each set of them.
+
+    differing: names of settings that all learners have, and of which not all have the same value.
+    """
     methods: dict[str, list[str]] = {}
     for name, cells in robot_results.cells.items():
-        text = ", ".join(_settings_of(compared(name), cells[0]["study"], robot.task.symmetry != "none"))
+        td3 = cells[0]["study"]["td3"]
+        settings = [f"{setting} {td3[setting]}" for setting in differing if setting in td3]
+        settings += _settings_of(compared(name), cells[0]["study"], robot.task.symmetry != "none")
+        text = ", ".join(settings)
         methods.setdefault(text, []).append(compared(name).label)
     return [(f"learner of {'; '.join(labels)}", text) for text, labels in methods.items()]
 

@@ -8,8 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order
+import numpy as np
+
+from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order, short_name
 from brakeline.deploy.experiments.comparison_cells import CellConfig
+from brakeline.deploy.experiments.comparison_table import evaluation_name
 from brakeline.deploy.experiments.experiment_jobs import configuration, stored_result
 from brakeline.deploy.experiments.task_engine import robot_folder
 from brakeline.errors import ResultError
@@ -26,16 +29,20 @@ def stored_cells(results: Path, robot: str) -> list[dict[str, Any]]:
     """Return the stored cells of a robot, by method and seed.
 
     Raises:
-        ResultError: a file is damaged, or cells differ in more than the method and its settings.
+        ResultError: a file is damaged or a copy, or cells differ in more than the method and its settings.
     """
     folder = robot_folder(results, robot)
-    cells = [stored_result(path) for path in _paths(folder)]
+    cells = [_named_cell(path) for path in _paths(folder)]
     order = in_order(cell["study"]["method"] for cell in cells)
     cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
     _check_comparable([cell["study"] for cell in cells], folder)
+    _check_episodes(cells, folder)
     for method in order:
         models = [cell["model"] or {} for cell in cells if cell["study"]["method"] == method]
-        if len({json.dumps(model.get("settings"), sort_keys=True) for model in models}) > 1:
+        if (
+            len({json.dumps([model.get("settings"), str(model.get("samples"))], sort_keys=True) for model in models})
+            > 1
+        ):
             raise ResultError(SEVERAL.format(folder=folder, method=method))
     return cells
 
@@ -43,12 +50,48 @@ def stored_cells(results: Path, robot: str) -> list[dict[str, Any]]:
 def check_addable(results: Path, cells: Sequence[CellConfig]) -> None:
     """Raise ResultError if cells to run would not compare with the stored ones that they do not replace."""
     folder, names = robot_folder(results, cells[0].robot), {cell.name for cell in cells}
-    studies = [stored_result(path)["study"] for path in _paths(folder) if path.stem not in names]
+    studies = [_named_cell(path)["study"] for path in _paths(folder) if path.stem not in names]
     _check_comparable([*studies, *map(configuration, cells)], folder)
 
 
 def _paths(folder: Path) -> list[Path]:
     return [path for path in sorted(folder.glob("*-s*.json")) if CELL.search(path.name)]
+
+
+def _named_cell(path: Path) -> dict[str, Any]:
+    """Return the cell in a file. Raises ResultError: it is damaged, or a copy of another cell."""
+    cell = stored_result(path)
+    name = f"{short_name(cell['study']['method'])}-s{cell['study']['seed']}"
+    if path.stem != name:
+        raise ResultError(f"{path} holds the cell {name}, which would count twice: move it away")
+    return cell
+
+
+def _check_episodes(cells: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Raise ResultError if a cell lacks an evaluation or a figure, or has another number of episodes than others."""
+    counts: dict[str, set[int]] = {}
+    for cell in cells:
+        path = folder / f"{short_name(cell['study']['method'])}-s{cell['study']['seed']}.json"
+        _check_columns(cell["training"]["episodes"], f"{path}: the episodes of the training")
+        for arena in cell["study"]["arenas"]:
+            trial = evaluation_name(cell["study"]["method"], arena)
+            if trial not in cell["evaluations"]:
+                raise ResultError(f"{path} has no evaluation {trial}: run it again with --again, or move it away")
+            episodes = cell["evaluations"][trial]["episodes"]
+            _check_columns(episodes, f"{path}: the episodes of {trial}")
+            counts.setdefault(trial, set()).add(len(episodes["goal"]))
+    if several := [f"{trial} ({', '.join(map(str, sorted(n)))})" for trial, n in counts.items() if len(n) > 1]:
+        raise ResultError(f"{folder}: the cells have more than one number of episodes in {several[0]}")
+
+
+def _check_columns(episodes: dict[str, list[float]], what: str) -> None:
+    """Raise ResultError if the columns of episodes have several lengths, or hold a value that is not finite."""
+    columns = [np.asarray(values, float) for values in episodes.values()]
+    if len({len(column) for column in columns}) > 1 or not all(np.isfinite(column).all() for column in columns):
+        raise ResultError(
+            f"{what} have columns of several lengths, or a value that is not finite: run it again with --again, or "
+            "move it away"
+        )
 
 
 def _check_comparable(studies: Sequence[dict[str, Any]], folder: Path) -> None:
@@ -75,4 +118,6 @@ def _check_comparable(studies: Sequence[dict[str, Any]], folder: Path) -> None:
 def _settings(study: dict[str, Any]) -> str:
     """Return the settings of a cell's filter and learner, without defaults of the learner: older cells lack some."""
     td3 = {name: value for name, value in study["td3"].items() if value != getattr(TD3Config(), name, None)}
-    return json.dumps([study.get("model_config"), study.get("penalty", 1.0), td3], sort_keys=True)
+    return json.dumps(
+        [study.get("model_config"), study.get("penalty", 1.0), study.get("code", ""), td3], sort_keys=True
+    )

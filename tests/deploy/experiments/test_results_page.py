@@ -19,7 +19,7 @@ from brakeline.deploy.experiments.conservatism import Conservatism
 from brakeline.deploy.experiments.evaluate import FRESH
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.results_page import RobotResults, page
-from brakeline.deploy.experiments.stored_cells import stored_cells
+from brakeline.deploy.experiments.stored_cells import check_addable, stored_cells
 from brakeline.deploy.experiments.tuning_trials import (
     SEED_KEY,
     FilterTuning,
@@ -208,6 +208,72 @@ def test_a_full_disk_leaves_the_tables_that_were_there(results):
     with full_disk(1_000), pytest.raises(OSError, match="File too large"):
         command.run()
     assert before == {path: path.read_bytes() for path in before}
+
+
+def test_a_copied_cell_does_not_count_twice(results):
+    cell = results / "ground" / "ddpc-s0.json"
+    copy = cell.with_name("ddpc-s7.json")
+    copy.write_text(cell.read_text())
+    with pytest.raises(ResultError, match=r"ddpc-s7\.json holds the cell ddpc-s0"):
+        stored_cells(results, "ground")
+    with pytest.raises(ResultError, match=r"ddpc-s7\.json holds the cell ddpc-s0"):
+        check_addable(results, cell_configs("ground", ("none",), (7,)))
+
+
+def without_an_arena(cell):
+    del cell["evaluations"]["trained-none-dense"]
+
+
+def without_an_episode(cell):
+    cell["evaluations"]["trained-none-dense"]["episodes"]["goal"].pop()
+
+
+def with_fewer_episodes(cell):
+    for column in cell["evaluations"]["trained-none-dense"]["episodes"].values():
+        column.pop()
+
+
+def without_a_number(cell):
+    cell["training"]["episodes"]["reward"][3] = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        (without_an_arena, r"none-s0\.json has no evaluation trained-none-dense"),
+        (without_an_episode, r"none-s0\.json: the episodes of trained-none-dense"),
+        (with_fewer_episodes, "more than one number of episodes in trained-none-dense"),
+        (without_a_number, r"none-s0\.json: the episodes of the training"),
+    ],
+)
+def test_a_cell_that_is_not_whole_is_named(results, how, words):
+    change(results / "ground" / "none-s0.json", how)
+    with pytest.raises(ResultError, match=words):
+        stored_cells(results, "ground")
+
+
+def test_cells_with_other_numbers_of_recorded_periods_are_not_mixed(results):
+    """The tables state one number for all seeds of a method."""
+    change(results / "ground" / "ddpc-s0.json", lambda cell: cell["model"].update(samples=1_000))
+    with pytest.raises(ResultError, match="ddpc has cells of several settings"):
+        stored_cells(results, "ground")
+
+
+def test_cells_of_two_versions_of_a_filter_of_your_own_are_not_mixed(results):
+    """The file of a filter may change between two seeds."""
+    for number, code in enumerate(("1", "2")):
+        change(results / "ground" / f"none-s{number}.json", lambda cell, code=code: cell["study"].update(code=code))
+    with pytest.raises(ResultError, match="none has cells of several settings"):
+        stored_cells(results, "ground")
+
+
+def test_the_page_does_not_state_one_methods_learner_as_that_of_all(results):
+    """`compare --td3.gamma 0.9 --methods none` gives one method another learner."""
+    for path in (results / "ground").glob("none-s*.json"):
+        change(path, lambda cell: cell["study"]["td3"].update(gamma=0.9))
+    rows = {row.split("|")[1].strip(): row for row in page(results, ["ground"]).splitlines() if row.startswith("| ")}
+    assert "gamma" not in rows["all learners"] and "batch 128" in rows["all learners"]
+    assert "gamma 0.9," in rows["learner of TD3"] and "gamma 0.99," in rows["learner of ours"]
 
 
 def test_a_damaged_cell_is_named_with_what_to_do(results):
