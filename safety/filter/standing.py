@@ -18,7 +18,6 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
     as standing only if the sets of its plan contain its present position in every period, up to the measurement error.
     In joint space, this is about the coordinates that have a limit.
 
-
     Args:
         z: regressors of the plan.
     """
