@@ -1,7 +1,8 @@
 """Serve HTTP to programs and pages of this machine, to a bounded number of clients, each for a bounded time.
 
-A client that sends its request slowly, or nothing, keeps its connection for `REQUEST_TIME`, and only while no other
-client needs the place. A request that names a foreign host, or comes from a foreign page, is refused (`allowed_hosts`).
+A client that sends its request slowly, or no request, keeps its connection for `REQUEST_TIME` at most. It loses the
+connection earlier if another client needs the place. The server refuses a request that names a foreign host, or comes
+from a foreign page (`allowed_hosts`).
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class TimedReader(io.RawIOBase):
         self._until = time.monotonic() + REQUEST_TIME
 
     def readable(self) -> bool:
-        """Return True: a reader reads."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
@@ -102,11 +103,11 @@ class BoundedServer(ThreadingHTTPServer):
         """Listen.
 
         Args:
-            handler: makes a handler, a `BoundedHandler`.
+            handler: makes a `BoundedHandler` for each client.
             own_port: whether a request must name the port of this server; a container may map it to another one.
 
         Raises:
-            OSError: the address is in use, or not of this machine, or its port is no port.
+            OSError: the address is in use or not of this machine, or the port is out of range.
         """
         if not 0 <= address[1] <= LARGEST_PORT:  # the socket would raise an OverflowError
             raise OSError(f"{address[1]} is no port: ports are 0 to {LARGEST_PORT}")

@@ -14,11 +14,11 @@ def check_numbers(values: object, *names: str, least: float | None = None, above
     Args:
         values: has the numbers, or tuples of them, as attributes.
         names: of the attributes.
-        least: the smallest number that makes sense.
-        above: the largest number that does not.
+        least: the smallest allowed number.
+        above: all numbers must be larger than this one.
 
     Raises:
-        ValueError: a number makes no sense.
+        ValueError: a number is not allowed.
     """
     for name in names:
         value: Numbers = getattr(values, name)
@@ -32,7 +32,7 @@ def check_numbers(values: object, *names: str, least: float | None = None, above
 
 
 def check_most(values: object, *names: str, most: float) -> None:
-    """Check that numbers are not too large; `values` and `names` as for `check_numbers`. Raises ValueError."""
+    """Check that numbers are not above `most`. values, names: see `check_numbers`. Raises ValueError."""
     for name in names:
         value: Numbers = getattr(values, name)
         if any(number > most for number in _numbers(value)):
@@ -40,7 +40,7 @@ def check_most(values: object, *names: str, most: float) -> None:
 
 
 def check_ranges(values: object, *names: str) -> None:
-    """Check pairs (least, most) of finite numbers; `values` and `names` as for `check_numbers`.
+    """Check pairs (least, most) of finite numbers. values, names: see `check_numbers`.
 
     Raises:
         ValueError: a number is not finite, or below 0, or the largest one comes first.
@@ -49,16 +49,18 @@ def check_ranges(values: object, *names: str) -> None:
     for name in names:
         low, high = getattr(values, name)
         if low > high:
-            raise ValueError(f"{name} = {_shown((low, high))} has the largest number first")
+            raise ValueError(f"{name} = {_shown((low, high))} has the largest number first: exchange them")
 
 
 def check_sizes(values: object, **counts: tuple[int, int]) -> None:
-    """Check the ranges of sizes [m] by their names. They are above 0 where there can be obstacles of them.
+    """Check the ranges of the sizes of obstacles [m]. If there can be obstacles of a size, it must be above 0.
 
-    counts: (least, most) number of these obstacles.
+    Args:
+        values: has the ranges as attributes.
+        counts: the name of each range, and the (least, most) number of its obstacles.
 
     Raises:
-        ValueError: a size makes no sense.
+        ValueError: a size is not allowed.
     """
     for name, (_, most) in counts.items():
         check_ranges(values, name)

@@ -1,4 +1,4 @@
-"""The directions of a lidar's rays: the first coordinates of an observation, which `sim` casts in this order."""
+"""The directions of a lidar's rays. An observation begins with their ranges, in this order."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def planar_rays(count: int, degrees: float, range: float) -> LidarRays:
 
 
 def spherical_rays(azimuths: int, elevations: int, degrees: float, range: float) -> LidarRays:
-    """Return rays at azimuths over 360° from straight ahead; at each azimuth, elevations ascend over `degrees`."""
+    """Return rays at azimuths over 360°, from straight ahead. At each azimuth, elevations ascend over `degrees`."""
     spread = math.radians(degrees)
     around = 2.0 * math.pi * np.arange(azimuths) / azimuths
     up = np.linspace(-0.5 * spread, 0.5 * spread, elevations)

@@ -1,7 +1,7 @@
-"""A planar scan: ranges of one turn of a range sensor, from which free space is computed where there is no map.
+"""A planar scan: the ranges of one turn of a range sensor. Without a map, the filter computes free space from it.
 
 A beam with a range ρ means: space is free from the sensor up to ρ, within the range error. A beam with 0 or NaN has no
-information: the target was too near, the return was lost, or the sensor is blind there. The visibility memory
+information: the obstacle was too near, the reflection was lost, or the sensor is blind there. The visibility memory
 (`safety/perception/visibility_memory.py`) fills such beams with space that was free before.
 """
 
@@ -20,7 +20,7 @@ from brakeline.messaging.value_equality import ComparedByValue
 
 MAX_BEAMS = 1000
 MAX_FAR = 1000.0  # largest range of a sensor [m]: a larger one is in mm
-BEYOND_FAR = 10.0  # times `far`; a larger range is in mm
+BEYOND_FAR = 10.0  # times `far`; a larger range must be in mm
 MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]
 MAX_TRACK_VALUE = 1e4  # largest speed [m/s], error [m/s] and acceleration [m/s²] of a track
 
@@ -56,7 +56,7 @@ def check_numbers(
     if not 0.0 <= far <= MAX_FAR:
         raise BadScan(f"a {name}'s `far` is finite, and from 0 to {MAX_FAR:g} m, not {far:g}: give it in m")
     if not (math.isfinite(least_width) and least_width > 0.0):
-        raise BadScan(f"a {name}'s least width must be positive")
+        raise BadScan(f"a {name}'s least width must be finite and above 0 m, not {least_width:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ class Scan(ComparedByValue):
         more = (self.doubt, self.acceleration, self.least_radius)
         check_numbers("scan", (*self.pose, *self.mount), self.far, (*bounds, *more), self.least_width)
         if (largest := float(np.nan_to_num(self.ranges).max(initial=0.0))) > BEYOND_FAR * self.far:
-            # Beyond `far` a beam hits nothing: in mm, all ranges would say that space is free.
+            # A range beyond `far` means no hit. If ranges were in mm, all of them would mean free space.
             raise BadScan(f"a range of {largest:g} m with `far` {self.far:g} m: give both in m, and `far` for no hit")
         if self.doubt != int(self.doubt):
             raise BadScan("a scan's doubt is a whole number of beams")

@@ -35,7 +35,7 @@ class Sample:
     received: int  # ns since the Unix epoch
 
     def message(self) -> Any:
-        """Return the payload as the topic's type. It is decoded once: do not change it.
+        """Return the payload as the topic's type. Do not change it: every call returns the same object.
 
         Raises:
             Malformed: the payload is invalid, or names another robot or source than the key.
@@ -102,7 +102,7 @@ class Listener(Subscription):
         rejected: RejectedMessages,
     ) -> None:
         self.topic, self._cut, self._handler = topic, len(prefix) + 1, handler
-        self._delivering = threading.Lock()  # samples come alone and in bundles, by two threads
+        self._delivering = threading.Lock()  # one thread delivers single samples, another one those of bundles
         self._keys_of: Counter[str] = Counter()  # by identity
         self._known: set[str] = set()  # keys
         super().__init__(key, receiver, self._take, rejected)
@@ -129,9 +129,11 @@ class Listener(Subscription):
         if not all(NAME.fullmatch(part) for part in key.split("/")):
             raise Malformed(f"{key[:200]!r} is no key of {self.topic.name}")
         if len(self._known) >= MOST_KEYS:
-            raise Malformed(f"{key}: there are already {MOST_KEYS} keys")
+            raise Malformed(f"{key[:200]}: there are {MOST_KEYS} keys already: divide the robots among several buses")
         sender = sender_of(self.topic, key)
         if self._keys_of[sender] >= MOST_KEYS_OF_ONE:
-            raise Malformed(f"{key[:200]}: {sender} publishes at {MOST_KEYS_OF_ONE} keys already")
+            raise Malformed(
+                f"{key[:200]}: {sender} publishes at {MOST_KEYS_OF_ONE} keys already: divide its robots among processes"
+            )
         self._keys_of[sender] += 1
         self._known.add(key)
