@@ -1,4 +1,4 @@
-"""Mapping between an environment's actions and a robot's inputs."""
+"""Map an environment's actions to a robot's inputs, and back."""
 
 from __future__ import annotations
 
@@ -47,9 +47,8 @@ def normalised(robot: Robot) -> ActionMapping:
 
     def action_to_control(action: ArrayLike) -> Array:
         given = np.asarray(action, float)
-        clipped = np.where(
-            np.isfinite(given), np.clip(given, -1.0, 1.0), given
-        )  # the filter must see what is not finite
+        # Infinity is not clipped, because the filter must see it.
+        clipped = np.where(np.isfinite(given), np.clip(given, -1.0, 1.0), given)
         return np.asarray(low + 0.5 * width * (clipped + 1.0))
 
     return ActionMapping(action_to_control, lambda control: np.clip(2.0 * (control - low) / width - 1.0, -1.0, 1.0))
@@ -86,6 +85,6 @@ def action_for(control: Array, mapping: ActionMapping, space: gymnasium.Space[An
     action = mapping.control_to_action(control.copy())
     if not isinstance(space, gymnasium.spaces.Box):
         return action
-    if space.dtype is not None and space.dtype.kind in "iu":  # a cast cuts off: 28.999999999999996 became 28
+    if space.dtype is not None and space.dtype.kind in "iu":  # a cast would make 28 of 28.999999999999996
         action = np.rint(action)
     return np.asarray(action, dtype=space.dtype).reshape(space.shape)

@@ -34,7 +34,7 @@ class VectorSafetyWrapper(VectorWrapper):
     The arguments are those of `SafetyWrapper` for k environments: `state(env, observations, infos)` returns (k, n),
     `obstacles` returns k lists, and `actions` maps (k, m). `step` adds to `infos`: `safety` (k answers; None for an
     environment that is reset in this step, or whose state is missing or not usable), `penalty` (k,) and `diagnostics`
-    (a dict of k values each; of a reset environment, the inputs say nothing).
+    (a dict of arrays with k rows; in the row of a reset environment, `proposed` and `executed` have no meaning).
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class VectorSafetyWrapper(VectorWrapper):
         return faults
 
     def _views(self) -> tuple[Any, Any]:
-        """Return the environments' states (k, n) and lists of obstacles; None instead of a list: only a scan counts."""
+        """Return the environments' states (k, n) and lists of obstacles; None for one that has a scan only."""
         assert self._now is not None
         states = self._state(self.env, *self._now)
         near = self._obstacles(self.env, *self._now) if self.client.robot.position_dim else [None] * self.num_envs

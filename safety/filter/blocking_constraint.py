@@ -42,12 +42,12 @@ def why_not_allowed(margin: float, of_space: bool = True, too_long_for: float = 
 
 @dataclass(frozen=True, eq=False)
 class BlockingConstraint(ComparedByValue):
-    """The constraint that a proposal violated, or came nearest to."""
+    """The constraint that a proposal violates most, or comes nearest to."""
 
-    # `cylinder`, `box`, `sphere` or `wall`, with the prefix `moving ` if it moves; `unseen`; `robot` (another robot's
-    # reservation); `sight` (the tube leaves the visible space); or the name of a limit
+    # The kind of an obstacle (`cylinder`, `box`, `sphere` or `wall`, with the prefix `moving ` if it moves), `unseen`,
+    # `robot` (another robot's reservation), `sight` (the tube leaves the visible space), or the name of a limit.
     by: str
-    # distance from the tube to the half-space [m], or in the limit's own unit. Negative if the tube crosses it.
+    # Distance from the tube to the half-space [m], or to the limit in its own unit. Negative if the tube crosses it.
     room: float
     after: float  # time from now [s]
     normal: Array  # (d,): normal of the half-space, away from the free side, world. Empty if there is no half-space.
@@ -85,21 +85,28 @@ class Planes:
     keep_off: float  # distance to the obstacles [m]
     measured: Array  # (d,): bound of the position's measurement error [m]
 
-    def itself(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
-        """Return the half-space (d,), () at the surface of an obstacle with that margin, without the body's radius."""
+    def at_surface(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
+        """Return the normal (d,) and the offset of a half-space that touches the obstacle itself.
+
+        `offsets` leave room for the body, the margin and the measurement error. This half-space does not.
+
+        Args:
+            which: number of the half-space.
+            margin: margin of this obstacle [m].
+        """
         normal = self.normals[which, period]
         distance = max(self.keep_off + margin, 0.0) + float(np.abs(normal) @ self.measured)
         return normal, float(self.offsets[which, period]) + distance
 
 
 def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes: list[Planes]) -> BlockingConstraint:
-    """Return the constraint of a row; planes: the half-spaces of each disc under the proposal."""
+    """Return the constraint of a row, which is `room` away. planes: the half-spaces of each disc under the proposal."""
     N, T = robot.horizon, robot.period
     number = row
     for disc in planes:
         rows = rows_per_obstacle(N) * len(disc.normals)
         if number < rows:
-            return _about_an_obstacle(number, room, robot, around, disc)
+            return _obstacle_constraint(number, room, robot, around, disc)
         number -= rows
     if around.other_reservations is not None:
         corners = 2**robot.position_dim
@@ -114,7 +121,7 @@ def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes
     return BlockingConstraint.nowhere(robot.limits[limit].name, room, T * after)
 
 
-def _about_an_obstacle(
+def _obstacle_constraint(
     row: int, room: float, robot: Robot, around: ConstraintSources, planes: Planes
 ) -> BlockingConstraint:
     """Return the constraint of a row that belongs to a disc."""
@@ -124,12 +131,10 @@ def _about_an_obstacle(
     when = end if end < N else min(end - N + 1, N)
     start, ends = planes.start, planes.ends
     if isinstance(around.unseen, OccludedRegions) and which >= around.obstacles:
-        by, (normal, level) = UNSEEN, planes.itself(which, period)
+        by, (normal, level) = UNSEEN, planes.at_surface(which, period)
     elif which < len(around.near):
-        by, (normal, level) = (
-            around.near.kind(which),
-            planes.itself(which, period, float(around.near.margin[which])),
-        )
+        by = around.near.kind(which)
+        normal, level = planes.at_surface(which, period, float(around.near.margin[which]))
     else:
         by, normals, offsets = _moving_or_unseen(which - len(around.near), robot, around, start, ends)
         normal, level = normals[0, period], float(offsets[0, period])

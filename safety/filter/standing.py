@@ -1,4 +1,4 @@
-"""Whether a robot stands: by its request, and by what the model set predicts."""
+"""Decide from a request and the model set whether a robot stands."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from brakeline.safety.filter.request import Request
 
 
 def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array) -> bool:
-    """Return whether the robot stands and its plan is to stand. No model set needs to verify that.
+    """Return whether the robot stands and its plan is to go on standing. Such a plan needs no verification.
 
-    The first request of a program may be about a robot that drives already. Nothing was predicted of it. So the model
-    set must not predict that it leaves its place.
+    The first request of a program contains no prediction, and the robot may be driving already. Then the robot counts
+    as standing only if the sets of its plan contain its present position in every period, up to the measurement error.
 
     Args:
         z: regressors of the plan.

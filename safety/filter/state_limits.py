@@ -22,9 +22,9 @@ class StateLimits:
         weights · y_k = a·p_0 + b θ_0 + (aᵀR) p_k + rest        a: weights of the position, b: of the heading
 
     so each period gives a row `gradient z + spread m(z) <= most - a·p_0 - b θ_0 - |weights|·Z_v`. Each period but the
-    first also gives a row for its start, with its own chord deviation. The start of the first period is where the robot
-    is: without a row for it, a robot that was pushed beyond a limit may return. In that period it exceeds the limit by
-    at most the chord deviation and what it is beyond the limit already.
+    first also gives a row for its start, with its own chord deviation. The start of the first period has no row, so
+    that a robot that was pushed beyond a limit may return. In that period it exceeds the limit by at most the chord
+    deviation and its excess at the start.
 
     A measured heading is known up to whole turns. The limits of both sides bound an arc of less than a turn, and θ_0 is
     the heading that is nearest to the middle of this arc.
@@ -42,7 +42,7 @@ class StateLimits:
         chord_columns (rows per limit, N + 1): the chord deviation of each row; the last column: the stopping distance.
         row_periods (rows per limit,): the period of each row; N: the start of the first period.
         position_maps, other_maps: the maps of the tube (`Tube`): columns for z, for the generators, for the constant.
-        start_map: the map of the first period's start, in joint space.
+        start_map: in joint space, the map of the first period's start; otherwise None.
     """
 
     def __init__(self, robot: Robot, tube: Tube) -> None:
@@ -60,7 +60,7 @@ class StateLimits:
         self.nz, self.chord_columns = tube.position.shape[2], np.eye(N + 1)
         self.row_periods = np.append(np.arange(N), N - 1)
         self.chord_scales = np.linalg.norm(self.position_weights, axis=1) if d else robot.limit_scales
-        self.start_map: Array | None = None  # the map of the first period's start, in joint space
+        self.start_map: Array | None = None
         if not d:
             self.start_map = np.zeros((1, self.count, self.nz + tube.generators + 1))
             self.start_map[0, :, : len(robot.regressor)] = weights[:, list(robot.regressor)]
@@ -69,10 +69,10 @@ class StateLimits:
         elif self.position_weights.any():
             self.row_periods = np.append(self.row_periods, np.arange(N - 1))
             self.chord_columns = np.vstack([self.chord_columns, self.chord_columns[1:N]])
-        self._around(tube)
+        self._set_maps(tube)
 
-    def _around(self, tube: Tube) -> None:
-        """Gather the maps of a tube: columns for z, for the generators, and for the constant."""
+    def _set_maps(self, tube: Tube) -> None:
+        """Set the maps of a tube: columns for z, for the generators, and for the constant."""
         N = tube.horizon
         maps = np.concatenate([tube.more, tube.more_directions, tube.more_offset[..., None]], axis=2)
         maps = maps[:, self.other_coordinates]
@@ -82,14 +82,14 @@ class StateLimits:
     def around(self, tube: Tube) -> StateLimits:
         """Return the limits of the same robot around another tube."""
         other = copy(self)
-        other._around(tube)
+        other._set_maps(tube)
         return other
 
     def __len__(self) -> int:
         return self.count * len(self.row_periods)
 
-    def _nearest(self, heading: float) -> Array:
-        """Return a heading [rad] for each limit, by whole turns as near as possible to the middle of its arc."""
+    def _headings_near_arcs(self, heading: float) -> Array:
+        """Return the heading [rad] for each limit, shifted by whole turns to be nearest to the middle of its arc."""
         off = heading - self.arc_middle
         return self.arc_middle + off - math.tau * np.rint(off / math.tau)
 
@@ -100,9 +100,8 @@ class StateLimits:
         """
         both = (self.position_weights @ rotation) @ self.position_maps + self.other_maps  # (N, limits, nz + L + 1)
         both = (both if self.start_map is None else np.concatenate([both, self.start_map]))[self.row_periods]
-        bound = (
-            self.most - self.position_weights @ start - self.heading_weights * self._nearest(heading) - both[..., -1]
-        )
+        bound = self.most - self.position_weights @ start
+        bound = bound - self.heading_weights * self._headings_near_arcs(heading) - both[..., -1]
         # The chord deviation of every period, and the stopping distance at the last end.
         extra = self.chord_columns[:, None, :] * self.chord_scales[None, :, None]
         gradient = np.ascontiguousarray(both[..., : self.nz]).reshape(-1, self.nz)
@@ -121,7 +120,7 @@ def _middle_of_arc(robot: Robot, number: int) -> float:
 
 
 def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:
-    """Stack several groups of rows."""
+    """Return the rows of several groups, one group after the other."""
     if len(parts) == 1:
         return parts[0]
     return ConstraintRows(

@@ -132,9 +132,9 @@ class Dataset:
         """
         robot = self.robot
         if not self.trajectories:
-            raise BadData("the data set holds no trajectory")
+            raise BadData("the data set holds no trajectory: record or import some driving")
         if not 0.0 <= self.chord_deviation < math.inf:
-            raise BadData(f"the chord deviation {self.chord_deviation!r} is no length")
+            raise BadData(f"the chord deviation {self.chord_deviation!r} is no length: it is finite, and 0 m or more")
         for i, t in enumerate(self.trajectories):
             periods = len(t.inputs)
             shapes = t.states.shape, t.inputs.shape, t.paths.shape, t.turned.shape
@@ -146,20 +146,21 @@ class Dataset:
                 (periods,),
             )
             if shapes != wanted or not periods:
-                raise BadData(f"trajectory {i}: shapes {shapes} where {wanted} belong")
+                raise BadData(f"trajectory {i}: states, inputs, paths and turned have shapes {shapes}, not {wanted}")
             if t.before is not None and t.before.shape != (robot.action_dim,):
-                raise BadData(f"trajectory {i}: the input before it has shape {t.before.shape}")
+                raise BadData(f"trajectory {i}: before has shape {t.before.shape}, not {(robot.action_dim,)}")
             if t.headings is not None and t.headings.shape != t.paths.shape[:2]:
-                raise BadData(f"trajectory {i}: headings of shape {t.headings.shape}, paths of {t.paths.shape}")
+                raise BadData(f"trajectory {i}: headings has shape {t.headings.shape}, not {t.paths.shape[:2]}")
             for name in ("states", "inputs", "paths", "turned", "before", "headings"):
                 if getattr(t, name) is not None and not np.isfinite(getattr(t, name)).all():
                     raise BadData(f"trajectory {i}: {name} holds NaN or infinity")
             inputs = t.inputs if t.before is None else np.vstack([t.before, t.inputs])
             if (inputs < robot.low() - 1e-9).any() or (inputs > robot.high() + 1e-9).any():
-                raise BadData(f"trajectory {i}: an input is out of the robot's bounds")
+                raise BadData(f"trajectory {i}: an input is out of the robot's bounds: correct the bounds or the log")
             jumps = np.flatnonzero(_jump(robot, t) > 0.0)
             if len(jumps):
-                raise BadData(f"trajectory {i}: the position jumps in period {jumps[0]}: two recordings in one?")
+                why = f"trajectory {i}: the position jumps in period {jumps[0]}"
+                raise BadData(f"{why}: if two recordings meet there, give them as two trajectories")
         if (twice := repeated_driving(robot, self.trajectories)) is not None:
             raise BadData(
                 f"trajectories {twice.first} and {twice.second} hold the same driving, {twice.seconds:.0f} s in all: a "
@@ -173,7 +174,7 @@ class Dataset:
             shares: the share of each part; their sum is 1.
         """
         edges = np.cumsum([0.0, *shares])
-        place = (np.arange(len(self.trajectories)) * 0.6180339887) % 1.0  # low discrepancy: even over the recording
+        place = (np.arange(len(self.trajectories)) * 0.6180339887) % 1.0  # golden ratio: spreads each part evenly
         parts = np.searchsorted(edges, place, side="right") - 1
         return [
             replace(self, trajectories=tuple(t for t, p in zip(self.trajectories, parts, strict=True) if p == i))
@@ -190,7 +191,7 @@ class Dataset:
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
         robot = self.robot.in_lockstep()
         about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
-        about["bulge"] = self.chord_deviation
+        about["bulge"] = self.chord_deviation  # its former name, which files still have
         about["description"] = json.dumps(robot.description)  # as text, since the order of its names matters
         write_atomically(Path(path), pack(tensors, ENTRY, about))
 
@@ -212,7 +213,9 @@ class Dataset:
         robot = _recorded_robot(path, about)
         chord_deviation = about.get("bulge", 0.0)
         if not isinstance(chord_deviation, int | float) or not 0.0 <= chord_deviation < math.inf:
-            raise BadData(f"{path}: the chord deviation {chord_deviation!r} is no length")
+            raise BadData(
+                f"{path}: the chord deviation {chord_deviation!r} is no length: it is finite, and 0 m or more"
+            )
         data = Dataset(robot, _separated(path, tensors), about_data, float(chord_deviation))
         data.check()
         return data
@@ -227,7 +230,7 @@ class Dataset:
 
     @staticmethod
     def check_out(path: Path) -> None:
-        """Raise ValueError if `--out` names something else than a data set or a new file: it would be lost."""
+        """Raise ValueError if `--out` names something that is no data set, and that would be lost."""
         if path.is_dir():
             raise ValueError(f"--out {path} is a folder: give the path of a file, such as data.safetensors")
         if path.exists() and not has_entry(path.read_bytes(), ENTRY):
@@ -249,7 +252,7 @@ class Dataset:
 def bends(robot: Robot, states: Array) -> Array:
     """Return the sizes (T-1,) of the second differences of the position [m] in states (T+1, n).
 
-    In joint space, of the limits' values, in units of `Robot.limit_scales`.
+    In joint space, they are those of the limits' values, in units of `Robot.limit_scales`.
     """
     second = np.diff(states, 2, axis=0)
     if not robot.position_dim:
@@ -261,9 +264,9 @@ def _jump(robot: Robot, t: Trajectory) -> Array:
     """Return how much farther the measured position moved than dead reckoning and noise explain (T,) [m]."""
     moved = np.linalg.norm(np.diff(t.states[:, : robot.position_dim], axis=0), axis=1)
     steps = np.diff(t.paths, axis=1, prepend=0.0)
-    way = np.linalg.norm(steps, axis=2).sum(1)
+    driven = np.linalg.norm(steps, axis=2).sum(1)
     noise = 2.0 * np.linalg.norm(robot.measurement_bound[: robot.position_dim])
-    return np.asarray(moved - 2.0 * (way + noise))  # factor 2: detect gross errors, not slipping wheels
+    return np.asarray(moved - 2.0 * (driven + noise))  # factor 2: detect gross errors, not slipping wheels
 
 
 def _recorded_robot(path: Path | str, about: dict[str, Any]) -> Robot:
@@ -278,7 +281,7 @@ def _recorded_robot(path: Path | str, about: dict[str, Any]) -> Robot:
     except (UnknownRobot, ValueError, TypeError) as error:
         raise BadData(f"{path}: {error}") from error
     if robot.name != name:
-        raise BadData(f"{path} is of robot {name!r}, its description of {robot.name!r}")
+        raise BadData(f"{path} is about robot {name!r}, but its description is about {robot.name!r}: record it again")
     if not robot.accepts_layout(about.get("layout")):
         raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
     return robot
@@ -289,13 +292,13 @@ def _separated(path: Path | str, tensors: dict[str, Array]) -> tuple[Trajectory,
     lengths = tensors["lengths"]
     parts = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items() if name != "lengths"}
     if lengths.ndim != 1 or lengths.dtype.kind != "i" or (lengths <= 0).any():
-        raise BadData(f"{path}: the trajectories' lengths are no lengths")
+        raise BadData(f"{path}: the trajectories' lengths are no lengths: they are whole numbers above 0")
     total, count = lengths.sum(), len(lengths)
     wanted = {"states": total + count, "inputs": total, "paths": total, "turned": total, "before": count}
     if "headings" in parts:
         wanted["headings"] = total
     if any(len(parts[name]) != rows for name, rows in wanted.items()):
-        raise BadData(f"{path}: the trajectories' lengths do not add up")
+        raise BadData(f"{path}: the trajectories' lengths do not add up to the numbers of states and inputs")
     ends = np.cumsum(lengths)
     return tuple(
         Trajectory(

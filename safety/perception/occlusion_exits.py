@@ -1,15 +1,16 @@
-"""Where something hidden from a scan may come out from behind what the scan sees (docs/method.md §10).
+"""Find where something that a scan does not see may come out from behind what it sees (docs/method.md §10).
 
 A shadow begins behind a near surface. Whatever is in the shadow must cross the line along its edge before the sensor
 sees any part of it. The line goes from the near surface to what the sensor sees beyond. So everything that may come out
 is within speed times time of that line.
 
 Something at least as large as a disc of radius R needs room to hide. Let D be the distance from the line's near end to
-the nearest fully hidden disc. A point of the line at r from that end is no nearer to the disc than D - r. So whatever
-passes that point is no farther than something that starts at D on the line and goes straight on. So the line counts
-from D on.
+the nearest fully hidden disc. Take a point of the line at a distance r < D from that end. It is at least D - r from
+every hidden disc, so whatever comes out there has moved by D - r already. From the line's point at D, the way to this
+point is no longer than D - r. So whatever comes out at r gets no farther than something that starts at D, and only the
+part of the line from D on counts.
 
-The surface that hides something is assumed to stay until it has come out.
+The method assumes that a surface stays in place until everything behind it has come out.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ Array = NDArray[np.float64]
 
 SECTORS = 360  # of a turn
 SECTOR = 2.0 * math.pi / SECTORS  # rad
-DISC_SECTORS = 30  # to either side of a disc's center that may hide it
+DISC_SECTORS = 30  # on either side of a disc's center: what the scan sees there must be in front of the disc
 SLIT = 0.1  # m: a smaller step between two ranges lets nothing through
 
 
@@ -34,7 +35,7 @@ class OcclusionExits:
 
     before: NDArray[np.intp]  # (e,) number of the gap with the near surface
     angle: Array  # (e,) [rad] in the sensor's frame
-    # near, far: (e,) [m] from the sensor to the first and last point where something may pass
+    # near, far: (e,) [m], distances from the sensor to the first and the last point where something may come out
     near: Array
     far: Array
 
@@ -43,7 +44,7 @@ class OcclusionExits:
 
 
 def occlusion_exits(angles: Array, width: Array, free: Array, radius: float) -> OcclusionExits:
-    """Return the exits between gaps (`scan_coverage.gaps`); radius [m]: of the smallest thing that may hide."""
+    """Return the exits between gaps (`scan_coverage.gaps`). radius: of the smallest thing that may hide [m]."""
     after = np.roll(free, -1)
     edge = np.flatnonzero(np.abs(after - free) > SLIT)
     nearer = free[edge] < after[edge]
@@ -84,6 +85,7 @@ def minimum_by_sector(angles: Array, width: Array, free: Array, sectors: int) ->
     """Return the least free range (sectors,) [m] of the gaps that meet each sector of a turn, from angle 0 on."""
     least = np.full(sectors, np.inf)
     per = sectors / (2.0 * math.pi)
+    # A gap that ends on the border of two sectors meets both, in spite of rounding.
     first = np.floor(angles * per - 1e-9).astype(int)
     last = np.floor((angles + width) * per + 1e-9).astype(int)
     for step in range(int((last - first).max()) + 1):

@@ -1,4 +1,4 @@
-"""A predictive safety filter with equations of motion that somebody derived by hand.
+"""A predictive safety filter with equations of motion that were derived by hand.
 
 Wabersich and Zeilinger, "A predictive safety filter for learning-based control of constrained nonlinear dynamical
 systems", Automatica 2021: execute the first input, closest to the proposal, of a plan that meets all constraints and
@@ -35,16 +35,17 @@ SAMPLES = 4  # of a period
 STANDING = 4.0  # time constants after the first zero input until the robot counts as standing
 ITERATIONS = 5  # quadratic programs from one start
 CONVERGED = 1e-4  # of an input's range
+LEAST_SLOPE = 1e-4  # m for an input's whole range: rows with smaller gradients are left out
 ACCURACY = 1e-4  # m: a constraint violated by less is met
-LATER = 1e-2  # cost of a change of later inputs, beside that of the first one
+LATER = 1e-2  # weight of later inputs in the cost; that of the first one is 1
 STEP = 1e-4  # of an input's range, for derivatives
 
 
 class PredictiveFilter(RivalByHand):
-    """The filter as a method."""
+    """The predictive safety filter as a method of the comparison."""
 
     def __init__(self, model: Pretrained) -> None:
-        """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
+        """Make the method. Raises BadModel: the model is of another method, or does not fit the robot."""
         fits = is_unicycle(model.robot) or follows_velocities(model.robot)
         super().__init__(model, PSF, SETTINGS, fits, "speed and turn rate, or velocities")
         robot = self.robot
@@ -88,7 +89,7 @@ class PredictiveFilter(RivalByHand):
         return positions
 
     def _room(self, request: Request, plan: Array) -> float:
-        """Return the least distance of a plan to an obstacle, less the margin [m]."""
+        """Return the least distance from the path of a plan to an obstacle, less the margin [m]."""
         path = self.positions(request.state, plan[None])[0]
         lengths, _ = self.distances(request, path)
         return float(lengths.min(initial=math.inf)) - self.settings["margin"]
@@ -114,7 +115,7 @@ class PredictiveFilter(RivalByHand):
         return plan if self._room(request, plan) >= -ACCURACY else None
 
     def _limits(self, before: Array) -> tuple[Array, Array]:
-        """Return bounds and slew as rows A z <= b. before: the input in force, which the first one follows."""
+        """Return the bounds and the slew as rows A z <= b. before: the input in force."""
         robot, free, n = self.robot, self._free, self._free * self.robot.action_dim
         high, low = np.tile(robot.high() / self._scale, free), np.tile(robot.low() / self._scale, free)
         slew = np.tile(np.asarray(robot.action_slew) / self._scale, free + 1)
@@ -126,13 +127,13 @@ class PredictiveFilter(RivalByHand):
         return rows[np.isfinite(most)], most[np.isfinite(most)]
 
     def _plan(self, z: Array, before: Array) -> Array:
-        """Return the plan of scaled free inputs: within the bounds and the first slew, and zero at the end."""
+        """Return the plan of scaled free inputs: clipped to the bounds and to the first slew, and zero at the end."""
         inputs = np.clip(z.reshape(self._free, -1) * self._scale, self.robot.low(), self.robot.high())
         inputs[0] = self.robot.clip_input(inputs[0], before)
         return np.vstack([inputs, np.zeros((1, self.robot.action_dim))])
 
     def _rows(self, request: Request, z: Array) -> tuple[Array, Array]:
-        """Return the linearised distances as rows A z <= b of unit length, those that the inputs can change."""
+        """Return the distances that the inputs can change, linearised, as rows A z <= b of unit length."""
         steps = np.vstack([np.zeros_like(z), STEP * np.eye(len(z))])
         path = self.positions(request.state, np.stack([self._unclipped(z + step) for step in steps]))
         slopes = (path[1:] - path[0]) / STEP  # (free inputs, samples, d)
@@ -140,8 +141,8 @@ class PredictiveFilter(RivalByHand):
         rows = -np.einsum("isd,fsd->isf", normals, slopes).reshape(-1, len(z))
         level = (lengths - self.settings["margin"]).ravel() + rows @ z
         sizes = np.linalg.norm(rows, axis=1)
-        moved = sizes > CONVERGED
-        return rows[moved] / sizes[moved, None], level[moved] / sizes[moved]
+        changes = sizes > LEAST_SLOPE
+        return rows[changes] / sizes[changes, None], level[changes] / sizes[changes]
 
     def _unclipped(self, z: Array) -> Array:
         return np.vstack([z.reshape(self._free, -1) * self._scale, np.zeros((1, self.robot.action_dim))])

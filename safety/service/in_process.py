@@ -49,10 +49,10 @@ class InProcess:
             method: the filter or a rival.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description.
-            acceleration_age: your states hold the horizontal acceleration of this long ago [s].
+            acceleration_age: age of the horizontal acceleration in your states [s].
 
         Raises:
-            TypeError: `method` is neither.
+            TypeError: `method` is neither the filter nor a rival.
             TooLoose: the report states a larger probability, or there is no report.
         """
         if not hasattr(method, "observed"):  # clients and fleets decide too, on other arguments
@@ -92,7 +92,8 @@ class InProcess:
 
         The filter decides on many at once (`Filter.decide_all`).
 
-        It raises as `decide` does, before it commits to any plan.
+        Raises:
+            BadRequest, BadShape: see `decide`. Then no backup plan has changed.
         """
         many = getattr(self.method, "decide_all", None)  # the rivals decide one by one
         decisions = many(requests) if many else [self.method.decide(request) for request in requests]

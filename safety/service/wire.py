@@ -52,9 +52,9 @@ def digest(batch: bytes) -> bytes:
 def batch_of(payload: bytes) -> pb.RequestBatch:
     """Return the batch in a payload. Raises BadRequest if it is not a batch, or too large."""
     if len(payload) > MAX_BATCH_SIZE:
-        raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {MAX_BATCH_SIZE}")
+        raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {MAX_BATCH_SIZE}: send several")
     if _count_requests(payload, MAX_REQUESTS) > MAX_REQUESTS:
-        raise BadRequest("requests", f"a batch has at most {MAX_REQUESTS} requests")
+        raise BadRequest("requests", f"a batch has at most {MAX_REQUESTS} requests: send several")
     try:
         batch = pb.RequestBatch.FromString(payload)
     except DecodeError as error:
@@ -63,7 +63,9 @@ def batch_of(payload: bytes) -> pb.RequestBatch:
         raise BadRequest("requests", "the batch holds no request")
     obstacles = sum(len(request.obstacles) for request in batch.requests)
     if obstacles > MAX_OBSTACLES:
-        raise BadRequest("obstacles", f"{obstacles} obstacles; at most {MAX_OBSTACLES} can be decided on at once")
+        raise BadRequest(
+            "obstacles", f"{obstacles} obstacles; a batch has at most {MAX_OBSTACLES}: send several, or near ones only"
+        )
     return batch
 
 
@@ -110,10 +112,10 @@ def request_of(
     """Return the request in a message.
 
     Args:
-        message: about the robot.
-        robot: of the method that decides.
-        reservation: current one of a fleet's robot.
-        other_reservations: of the fleet's other robots.
+        message: a request about this robot.
+        robot: the robot of the method that decides.
+        reservation: the present reservation of this robot, if it is in a fleet.
+        other_reservations: those of the fleet's other robots.
 
     Raises:
         BadRequest: an obstacle, a size or a value is wrong; `field` names it.
@@ -154,7 +156,7 @@ def _past_of(message: pb.Request, robot: Robot) -> PastWindow | None:
         return None
     states, inputs, N = array_of(message.past_states), array_of(message.past_inputs), robot.horizon
     if (states.size, inputs.size) != (N * robot.state_dim, (N + 1) * robot.action_dim):
-        why = f"past has {N} states and {N + 1} inputs of {robot.name}: send a whole window, or none"
+        why = f"past must have {N} states and {N + 1} inputs of {robot.name}: send a whole window, or none"
         raise BadRequest("past", why)
     return PastWindow(states.reshape(N, -1), inputs.reshape(N + 1, -1), message.past_from_start)
 
@@ -167,7 +169,7 @@ def array_of(field: Collection[float]) -> NDArray[np.float64]:
 def surroundings_of(messages: Sequence[pb.Obstacle], dim: int) -> tuple[Shapes, MovingObstacles | None]:
     """Return the standing and the moving obstacles in messages, as `split_moving`. Raises BadRequest.
 
-    A robot names the same standing obstacles in many requests, one after the other.
+    A cache holds the latest standing obstacles, because a robot sends the same ones in many requests.
     """
     if any(message.HasField("motion") for message in messages):
         return split_moving(obstacles_of(messages, dim), dim)
@@ -211,7 +213,7 @@ def reservation_of(m: pb.Reservation, robot: Robot) -> Reservation:
 
 
 def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
-    """Return the reply with a decision; queue_ms: time from receipt to the decision."""
+    """Return the reply with a decision. queue_ms: time from the receipt of the request to the decision."""
     message = pb.Decision(
         kind=KIND_NUMBERS[decision.kind],
         plan=decision.plan.ravel().tolist(),
@@ -238,7 +240,7 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
 
 
 def set_decision(step: pb.Step, decision: Decision) -> None:
-    """Set what a step says of its decision."""
+    """Copy the kind of a decision, its time and its flags to a step."""
     step.decision, step.decide_ms, step.broken = KIND_NUMBERS[decision.kind], decision.time_ms, decision.broken
     if decision.for_clearance is not None:
         step.for_clearance = decision.for_clearance
@@ -251,11 +253,11 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         BadRequest: its kind, tube or reservation does not fit the robot; `field` names it.
     """
     if m.kind not in KIND_NAMES:
-        raise BadRequest("kind", f"kind {m.kind}")
+        raise BadRequest("kind", f"{m.kind} is no kind of decision: use the version of the service")
     d = robot.position_dim
     tube = array_of(m.tube_center), array_of(m.tube_half_width)
     if {part.size for part in tube} not in ({0}, {robot.horizon * d}):  # the rivals have none
-        raise BadRequest("tube_center", "a tube of the wrong size")
+        raise BadRequest("tube_center", f"a tube of {robot.name} has {robot.horizon} boxes in {d} coordinates, or none")
     if not all(np.isfinite(part).all() for part in tube) or (tube[1] < 0.0).any():
         raise BadRequest("tube_center", "a tube that holds NaN, infinity or a negative half-width")
     stopped = None
@@ -273,7 +275,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
         bound=valid_bound(m.bound) if m.HasField("bound") else None,
-        # Of another share nothing is let out: then the largest score counts.
+        # Any other share counts as 0: then no score is left out, and the largest one counts.
         outside_share=m.outside_share if 0.0 <= m.outside_share <= MOST_OUTSIDE else 0.0,
         score=max(m.score, 0.0) if m.HasField("score") else None,
         plan_score=max(m.plan_score, 0.0) if m.HasField("plan_score") else None,
@@ -296,5 +298,5 @@ def error_reply(error: Exception) -> pb.Reply:
 
 
 def bad_reply(field: str, message: str) -> SafetyError:
-    """Return the error that a client raises because of a reply that is not valid."""
+    """Return the error that a client raises if a reply is not valid."""
     return SafetyError(pb.Error(type="BadReply", field=field, message=message))

@@ -154,7 +154,7 @@ def test_a_batch_about_other_robots_is_refused_as_a_whole(service, robot):
         (bad(plan=[0, 0, 0, 0, 0.1, 0]), "does not end in a stop: append one"),
         (bad(state=[0, 0, NAN, 0, 0]), "state holds NaN or infinity: follow the backup plan"),
         (bad(widening=0.5), "at least 1, not 0.5: send the factor"),
-        (bad(past_states=[0.0] * 5), "past has 3 states and 4 inputs of ground: send a whole window, or none"),
+        (bad(past_states=[0.0] * 5), "past must have 3 states and 4 inputs of ground: send a whole window, or none"),
         (bad(past_states=[NAN] * 15, past_inputs=[0.0] * 8), "past holds NaN or infinity: begin a new window"),
         (bad(predicted_center=[0.0] * 5, predicted_half_width=[-0.1] * 5), "negative half-width: send the prediction"),
     ],

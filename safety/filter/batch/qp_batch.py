@@ -1,6 +1,7 @@
-"""The QPs of a batch (docs/method.md §4): rows at linearised plans, presolve, solution; the batch is last.
+"""Build and solve the QPs of a batch (docs/method.md §4). The last axis of each array is the batch.
 
-The twin of `QPBuilder` and `qp_kernels.presolved_rows`. Its answers are candidates, as any solver's.
+This module does for many robots what `QPBuilder` and `qp_kernels.presolved_rows` do for one. The filter verifies its
+answers, as those of any solver.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from brakeline.safety.filter.batch.dual_active_set import BatchSolution, solve_b
 from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.qp import ROW_TIGHTENING, QPBuilder
 
-ROUNDING = 1e-9  # m: a comparison that is closer than this may turn out otherwise in another order of the sums
+ROUNDING = 1e-9  # m: the order in which numbers are added may decide a comparison of values that are nearer
 
 
 class RowBatch(NamedTuple):
@@ -51,15 +52,14 @@ class QPBatch:
         self._first = constant(first[builder.limited])
 
     def rows(self, scene: SceneBatch, plan: PlanBatch, z_0: Array) -> RowBatch:
-        """Return the rows of all half-spaces of plans, linearised there. z_0 (known, B): the known regressors."""
+        """Return the rows of all half-spaces, linearised at plans. z_0 (known, B): the known regressors."""
         xp, c = self._xp, self._constraints
         slopes = c.tube.gradient(plan.z, self.free)  # (N, C, F, B or 1)
         outputs = plan.path.outputs
         f = plan.z[self.known :]
         fixed = outputs - sum(slopes[:, :, j] * f[j] for j in range(self.free))  # at f = 0
-        constant = (
-            self._M_c @ xp.abs(self._W_c @ z_0) + self._m_0
-        )  # of the magnitudes (L+N+1, B): no free input changes it
+        # (L+N+1, B): the part of the magnitudes that no free input changes
+        constant = self._M_c @ xp.abs(self._W_c @ z_0) + self._m_0
         gradients, spreads, bounds = [], [], []
         for (*_, first, ends), planes in zip(c.discs, plan.planes, strict=True):
             normals = [ends.at_ends(part) for part in planes.turned]  # (E, K, B)
@@ -110,6 +110,7 @@ class QPBatch:
         least_t = xp.maximum(xp.abs(atom) - deviation, xp.zeros_like(atom))
         most_t = xp.abs(atom) + deviation
         bound = rows.bound - self._tightening
+        # The least and the largest value of each row, over all inputs within bounds and slew.
         least, most = xp.zeros_like(bound), xp.zeros_like(bound)
         for j in range(self.free):
             middle, aside = rows.gradient[j] * center[j], xp.abs(rows.gradient[j]) * radius[j]
@@ -119,7 +120,7 @@ class QPBatch:
         over = least - bound
         ruled_out = xp.any(over > ROUNDING, axis=0)
         unsure = ~ruled_out & xp.any(over > -ROUNDING, axis=0)
-        A, b = self._matter(rows, bound, most > bound)
+        A, b = self._selected(rows, bound, most > bound)
         changed = self._first @ before
         fixed = xp.concat(
             [
@@ -141,17 +142,17 @@ class QPBatch:
         impossible = ruled_out | (solution.infeasible & ~unsure)
         return solution.x[: self.free] * self._scale[: self.free], solved, impossible, solution.steps
 
-    def _matter(self, rows: RowBatch, bound: Array, matter: Array) -> tuple[Array, Array]:
-        """Return the rows that some input violates, as A (r, n, B) and b (r, B) in scaled unknowns, of unit length.
+    def _selected(self, rows: RowBatch, bound: Array, selected: Array) -> tuple[Array, Array]:
+        """Return the selected rows (R, B) as A (r, n, B) and b (r, B) in scaled unknowns, each of unit length.
 
-        r is the largest number of such rows in a lane; the other slots hold zeros.
+        r is the largest number of such rows in a lane. In a lane with fewer, the other rows are 0 <= 1.
         """
         xp = self._xp
-        count = int(xp.max(xp.sum(xp.astype(matter, xp.int64), axis=0))) if matter.shape[0] else 0
-        order = xp.argsort(xp.astype(~matter, xp.int8), axis=0, stable=True)[:count]
+        count = int(xp.max(xp.sum(xp.astype(selected, xp.int64), axis=0))) if selected.shape[0] else 0
+        order = xp.argsort(xp.astype(~selected, xp.int8), axis=0, stable=True)[:count]
         parts = [rows.gradient[j] for j in range(self.free)] + [rows.spread[t] for t in range(self._atoms)]
         scaled = [xp.take_along_axis(part, order, axis=0) * self._scale[j] for j, part in enumerate(parts)]
-        used = xp.take_along_axis(matter, order, axis=0)
+        used = xp.take_along_axis(selected, order, axis=0)
         square = sum(part * part for part in scaled)
         length = xp.maximum(xp.sqrt(square), xp.full_like(square, ROW_TIGHTENING))
         A = xp.where(used[:, None], xp.stack(scaled, axis=1) / length[:, None], 0.0)
