@@ -1,6 +1,6 @@
 """Plan paths on a grid: the clearance of every cell, and the best path from every cell to a goal.
 
-Only the functions that need SciPy import it: it takes a third of the start of an actor's process.
+Only the functions that need SciPy import it, because the import takes a third of the time to start an actor.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ClearanceMap:
     def __init__(self, obstacles: Sequence[Obstacle], bounds: Sequence[tuple[float, float]]) -> None:
         """bounds: (low, high) of each of the d = 2 or 3 axes [m].
 
-        Cells are cubes that fill the first axis. On the other axes the last one may end half a cell off the bound.
+        Cells are cubes that fill the first axis. On the other axes, the last cell may end half a cell from the bound.
         """
         widths = [high - low for low, high in bounds]
         self.dim = len(bounds)
@@ -42,7 +42,7 @@ class ClearanceMap:
 
     @cached_property
     def clearance(self) -> Array:
-        """The distances [m], one index per axis, x first."""
+        """The distances [m], with one index for each axis, x first."""
         return nearest_distances(self._shapes, self.centres).reshape(self.shape)
 
     @cached_property
@@ -97,7 +97,8 @@ class Routes:
 
     A path costs its length times 1 + `AVOIDANCE`·lack², where lack in [0, 1] is the share of the wanted clearance that
     is missing. Cells that the body does not fit in cost `BLOCKED` times their length, so that a robot in one of them
-    still finds a way out. One run serves the whole episode: a robot off its path follows the path of its new cell.
+    still finds a way out. One run of the algorithm is enough for an episode: a robot that has left its path follows the
+    path from its new cell.
     """
 
     AVOIDANCE = 30.0
@@ -114,9 +115,10 @@ class Routes:
         weight = np.where(free, 1.0 + self.AVOIDANCE * lack**2, self.BLOCKED)
         self._goal = int(grid.number(np.asarray(goal, dtype=np.float64)))
         cost, before = dijkstra(_graph(weight, grid.cell), directed=False, indices=self._goal, return_predecessors=True)
-        self._next = before
+        self._next = before  # for each cell, the next one on the path to the goal; the search began at the goal
         self._cost = cost.reshape(grid.shape)
-        # For interpolation: beside a free cell, no cell may have the cost of a path through a solid
+        # The interpolation also reads the cells beside free ones. Their cost must not be that of a path through an
+        # obstacle.
         nearby = minimum_filter(self._cost, size=3) + grid.cell
         self._cost[~free] = np.minimum(self._cost, nearby)[~free]
 
@@ -135,13 +137,16 @@ class Routes:
 
 
 def _graph(weight: Array, cell: float) -> csr_array:
-    """Return the edges, length times weight, from every cell to half of its neighbours; the others are reversed."""
+    """Return the costs of the edges between neighbouring cells: the length, times the mean weight of both cells.
+
+    Each edge occurs once, in one of its directions.
+    """
     from scipy.sparse import csr_array
 
     ids = np.arange(weight.size).reshape(weight.shape)
     rows, columns, costs = [], [], []
     for step in product((-1, 0, 1), repeat=weight.ndim):
-        if step <= (0,) * weight.ndim:
+        if step <= (0,) * weight.ndim:  # the cell itself, or the other direction of an edge
             continue
         here = tuple(slice(max(0, -d), n - max(0, d)) for d, n in zip(step, weight.shape, strict=True))
         there = tuple(slice(max(0, d), n - max(0, -d)) for d, n in zip(step, weight.shape, strict=True))

@@ -21,7 +21,7 @@ from brakeline.sim.sim_conditions import SensorFaults
 
 BEAMS = 360  # of the lidar, in a turn
 FLAWLESS = SensorFaults()
-TOUCHING = 1e-6  # m, a range that is not 0, which would say that a beam has no information
+TOUCHING = 1e-6  # m, in place of a range of 0, which means that a beam has no information
 
 
 class RealtimeEstimator(GroundEstimator):
@@ -29,7 +29,7 @@ class RealtimeEstimator(GroundEstimator):
 
     def __init__(self, noise: NoiseLevels, rng: np.random.Generator, pose: Array, *wheels: Any) -> None:
         super().__init__(noise, rng, pose, *wheels)
-        # distance [m] and turn rate [rad/s] of each sample since the last fix
+        # distance [m] and turn rate [rad/s] of each sample since the last fix, and of each of the last `RECENT` samples
         self._moves: list[tuple[float, float]] = []
         self._recent: list[tuple[float, float]] = []
 
@@ -53,8 +53,8 @@ class RealtimeEstimator(GroundEstimator):
             x, y, heading = self.pose
         else:
             x, y, heading = self._moved(path[-1], turned)
-        distances, rates = np.mean(self._recent, axis=0)
-        return np.array([x, y, wrap(heading), distances / self._sample_time, rates])
+        mean_distance, mean_rate = np.mean(self._recent, axis=0)
+        return np.array([x, y, wrap(heading), mean_distance / self._sample_time, mean_rate])
 
 
 class RealtimeGroundRobot(GroundRobot):
@@ -72,10 +72,9 @@ class RealtimeGroundRobot(GroundRobot):
         noise = noise or NoiseLevels()
         pose, wheels = self._true_pose(), self._wheels()
         self.realtime_estimator = RealtimeEstimator(noise, rng, pose, wheels, WHEEL_RADIUS, SAMPLE_TIME)
-        # collisions: how often the robot began to touch a static obstacle
+        # how often the robot began to touch a static obstacle, and whether it touches one now
         self.collisions, self._touches = 0, False
-        # m, least distance from its footprint to an obstacle so far
-        self.closest = float(self.clearance(self.true[:2]))
+        self.closest = float(self.clearance(self.true[:2]))  # m, least distance to an obstacle so far
         self.distance_driven = 0.0  # m
 
     def advance(self) -> None:
@@ -95,13 +94,13 @@ class RealtimeGroundRobot(GroundRobot):
 
 
 class SpinningLidar:
-    """A lidar that measures beam after beam, one turn in `SAMPLES` samples: the ranges of a turn have different times.
+    """A lidar that measures one beam after the other. A turn takes `SAMPLES` samples, so its ranges differ in time.
 
     A beam that hits nothing reports inf, one that hits something too near reports -inf, and one without information
     reports NaN (REP 117).
     """
 
-    farthest = 3.5  # m, limit of a range
+    farthest = 3.5  # m, the longest range that it measures
     mount = -0.032  # m, its position on the robot's x axis
     gap = 2.0 * math.pi / BEAMS  # rad between two beams
 
@@ -117,8 +116,8 @@ class SpinningLidar:
 
         Args:
             noise: standard deviation of a range [m].
-            nearest: the other limit of a range [m].
-            faults: of its beams; a scan is never late.
+            nearest: the shortest range that it measures [m].
+            faults: of its beams. Their delays have no effect: a scan is never late.
         """
         self.nearest, self._faults, self._rng = nearest, faults, rng
         self._angles: Array = np.asarray(self.gap * np.arange(BEAMS), float)
@@ -131,7 +130,7 @@ class SpinningLidar:
         """Measure the next sector from a true state (5,).
 
         Returns:
-            all ranges (beams,) [m] when the turn is complete, None before.
+            The ranges (beams,) [m] of the turn if this sector completes it, otherwise None.
         """
         heading = float(true[2])
         origin = true[:2] + self.mount * np.array([math.cos(heading), math.sin(heading)])
@@ -142,4 +141,4 @@ class SpinningLidar:
         limits = self.nearest, self.farthest
         turn = with_faults(np.maximum(turn, TOUCHING), self._angles, limits, self._faults, self._rng)
         reported = np.where(turn >= self.farthest, np.inf, np.where(turn < self.nearest, -np.inf, turn))
-        return np.where(turn == 0.0, np.nan, reported)
+        return np.where(turn == 0.0, np.nan, reported)  # only a fault makes a range 0

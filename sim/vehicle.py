@@ -66,7 +66,7 @@ class Vehicle(Protocol):
         """Change the vehicle's physics from now on; each kind of vehicle documents the names that it takes.
 
         Raises:
-            ValueError: the vehicle does not take this name, or not this value.
+            ValueError: the vehicle cannot change what has this name, or not to this value.
         """
 
 
@@ -77,7 +77,7 @@ class SimulatedVehicle:
     """Base class of the vehicles in MuJoCo: it makes their reports and changes their physics."""
 
     robot: Robot
-    samples: int  # positions that a report has of a period
+    samples: int  # number of positions in the report of a period
     arena: Arena
     true: Array
     measured: Array
@@ -86,7 +86,7 @@ class SimulatedVehicle:
     def clearance(self, states: Array) -> Array:
         """Return the distance [m] from the body in states (..., n) to the nearest obstacle, or inf.
 
-        Of a robot without a heading, and of a disc about the position, positions (..., d) are enough.
+        If the robot has no heading, or its body is a disc about the position, positions (..., d) are enough.
         """
         if self.robot.heading is not None and any(disc.arm > 0.0 for disc in self.robot.body):
             return body_clearance(self.robot, self.arena.shapes, states)
@@ -120,5 +120,5 @@ class SimulatedVehicle:
             raise ValueError(f"a {self.robot.kind} has no {', '.join(sorted(unknown))}; it has: {names}")
         for name, value in changes.items():
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} is 0 or more, not {value}")
+                raise ValueError(f"{name} must be finite and 0 or more, not {value}")
             setters[name](value)
