@@ -12,12 +12,13 @@ class RateLimiter:
 
         error = (inserts − warmup) · samples_per_insert − samples,    0 ≤ error < ceiling  (below 0 in the warm-up)
 
-    Sampling lowers the error, inserting raises it; each is allowed while the error stays in the band. The ceiling is at
-    least a batch and an insert, so that one of them is always allowed. Sampling starts after `warmup` inserts.
+    Sampling lowers the error, and inserting raises it. Each is allowed as long as the error stays in the band. The
+    ceiling is at least the size of a batch and the error of one insert, so that one of them is always allowed. Sampling
+    starts after `warmup` inserts.
     """
 
     def __init__(self, samples_per_insert: float, batch: int, warmup: int, ahead: float = 0.0) -> None:
-        """Start at zero. ahead: number of inserts that the actors may be ahead of the learner; 0: lockstep."""
+        """Start without inserts. ahead: by how many inserts actors may be ahead of the learner; 0: lockstep."""
         self.samples_per_insert, self.batch, self.warmup = samples_per_insert, batch, warmup
         self.ceiling = batch + samples_per_insert * (1.0 + ahead)
         self.inserts = 0
