@@ -18,11 +18,13 @@ from brakeline.logs.tube_stats import stated
 from brakeline.messaging.stated_share import percent
 
 BLOCKS = "▁▂▃▄▅▆▇█"
-# Rows of a curve's bins.
-SETS = {
-    **{"outside the sets": "beyond", "widening": "widening", "half-width [m]": "half_width"},
-    "slowed down": "slowed",
-}
+# Rows of the table of learning curves, and the names of their values in a bin.
+SETS = {"outside the sets": "beyond", "widening": "widening", "half-width [m]": "half_width", "slowed down": "slowed"}
+NOT_STATED = "not recorded: the program did not call `record_outcome`, nor `reset` with an outcome"
+LEARNER = (
+    "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, weights v{weights_version}, "
+    "staleness {staleness:.1f}, steps missing {missing}, duplicate {duplicates}"
+)
 
 
 def analyse(paths: Paths) -> Figures:
@@ -55,7 +57,7 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
         rows = [(key, *(str(topic[name]) for name in counts)) for key, topic in figures["topics"].items()]
         parts.append(plain_table(("topic", *counts), rows))
     if verbose and (metadata := figures.get("metadata")):
-        # Without the configuration, which is long: --json and --html have it.
+        # The configuration is long, so only --json and --html show it.
         groups = {name: v for name, v in metadata.items() if name != "configuration" and isinstance(v, dict)}
         rows = [(name, Text(", ".join(f"{k} {v}" for k, v in group.items()))) for name, group in groups.items()]
         parts.append(plain_table(("metadata", ""), rows))
@@ -63,7 +65,7 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
 
 
 def _several(figures: Figures) -> list[RenderableType]:
-    """Return the tables of several runs: each run, groups of seeds, and in what the runs differ."""
+    """Return the tables of several runs: of each run, of groups of seeds, and of settings that differ."""
     parts: list[RenderableType] = [_runs(figures["runs"])]
     if groups := figures.get("groups"):
         parts.append(_groups(groups))
@@ -143,14 +145,14 @@ def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
     yield "steps", f"{steps}" + known(", {:.1f}/s", figures.get("steps_per_s"))
     if figures.get("refused"):
         yield Text("steps that do not count", "red"), f"{figures['refused']}: repeated, or not permitted by the learner"
-    stated = figures.get("outcomes_stated", True)
-    yield "episodes", f"{episodes}" + (known(", mean reward {:.2f}", figures["mean_reward"]) if stated else "")
-    if not stated:
+    has_outcomes = figures.get("outcomes_stated", True)
+    yield "episodes", f"{episodes}" + (known(", mean reward {:.2f}", figures["mean_reward"]) if has_outcomes else "")
+    if not has_outcomes:
         yield "goals, collisions, rewards", NOT_STATED
     ends = ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts")
-    for name in ends if stated else ():
+    for name in ends if has_outcomes else ():
         text, interval = share(figures[name], episodes, within.get(name)), within.get(name)
-        if name == RUN_INTO:  # several in one episode are possible, so it has an interval of the mean number
+        if name == RUN_INTO:  # an episode may have several, so the interval is that of their mean number
             text = f"{figures[name]}" + known(", 95 %: {0[0]:.2g} to {0[1]:.2g} in an episode", interval)
         yield name.replace("_", " "), text
     interventions = share(figures["interventions"], steps, within.get("interventions"))
@@ -211,13 +213,6 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str | Text, str]]:
             yield Text(label, "red"), str(figures[name])
 
 
-NOT_STATED = "not recorded: the program did not call `record_outcome`, nor `reset` with an outcome"
-LEARNER = (
-    "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, weights v{weights_version}, "
-    "staleness {staleness:.1f}, steps missing {missing}, duplicate {duplicates}"
-)
-
-
 def _runs(runs: dict[str, Figures]) -> Table:
     """Format one row for each of several runs."""
     setup, ends = ("method", "certificate", "perception", "seed"), ("goals", "collisions")
@@ -239,7 +234,11 @@ def _times(figures: Figures) -> list[Table]:
     """Format decision times: by part if the log has the exchanges."""
     columns: Sequence[str] = ("mean", "std", "p50", "p90", "p99", "max")
     rows = [
-        (f"{kind} ({row['count']})" * (part == "round_trip"), part.replace("_", " "), *_milliseconds(row, columns))
+        (
+            f"{kind} ({row['count']})" if part == "round_trip" else "",
+            part.replace("_", " "),
+            *_milliseconds(row, columns),
+        )
         for kind, times in figures.get("latency_ms", {}).items()
         for part, row in times.items()
         if row is not None
@@ -259,7 +258,7 @@ def _milliseconds(row: Figures, columns: Sequence[str]) -> list[str]:
 
 
 def _driving(robot: str, kinds: Figures) -> Table:
-    """Format what the model set states by kind of driving beside what was driven."""
+    """Format the shares outside the stated sets by kind of driving, beside the bounds that the model set states."""
     rows = []
     for kind, counts in kinds.items():
         outside, bound = share(counts["outside"], counts["windows"], digits=2), counts["bound"]
@@ -324,5 +323,5 @@ def share(count: int, of: int, within: list[float] | None = None, digits: int = 
 
 
 def known(form: str, value: Any, otherwise: str = "") -> str:
-    """Format a value that is not None."""
+    """Format a value; `otherwise` stands for None."""
     return otherwise if value is None else form.format(value)

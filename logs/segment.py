@@ -35,8 +35,8 @@ Metadata = Mapping[str, Mapping[str, str]]
 Attachments = Mapping[str, bytes]  # file contents by name, e.g. model sets
 
 ABOUT = "brakeline"  # metadata of each log
-CLOCK, STEADY = "clock", "steady"  # an entry of the metadata of a log
-SEGMENT = "segment"  # an entry: the number of the file among those of its run
+CLOCK, STEADY = "clock", "steady"  # name and value of an entry of the metadata
+SEGMENT = "segment"  # name of an entry of the metadata: the number of the file among those of its run
 TIMES = {
     CLOCK: STEADY,
     "log_time": "ns since the Unix epoch, when the recorder received the message, by the clock at the recorder's "
@@ -113,7 +113,7 @@ def being_written(path: Path) -> bool:
 
 
 class BufferedFile:
-    """A file that `flush` extends by all waiting bytes or by none: a full disk never leaves part of a record."""
+    """A file that `flush` extends by all waiting bytes or by none, so that a full disk leaves no part of a record."""
 
     def __init__(self, file: BinaryIO) -> None:
         """Wrap a file, which must be unbuffered: otherwise an error would come late, and again on closing."""
@@ -134,7 +134,8 @@ class BufferedFile:
         Raises:
             OSError: the disk is full or broken; no waiting byte is in the file.
         """
-        with memoryview(self._waiting) as waiting:  # a view that an error's traceback holds would forbid `write`
+        # Without `with`, the traceback of an error would hold the view, and `write` would fail.
+        with memoryview(self._waiting) as waiting:
             try:
                 done = 0
                 while done < len(waiting):
@@ -242,7 +243,7 @@ class Segment:
             self.path.unlink(missing_ok=True)
 
     def _declare(self, entries: Sequence[Entry]) -> None:
-        """Register the channels that begin with these entries, and write the topics of our own outside the chunks."""
+        """Register the channels that begin with these entries. Write those of our own messages outside the chunks."""
         own: dict[str, str] = {}
         for key, kind in {entry.key: entry.type for entry in entries}.items():
             if key not in self._channels and len(self._channels) < MOST_CHANNELS:
