@@ -13,7 +13,7 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import read_reply
 from brakeline.safety.service.filter_client import Answer, accept
 
-Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError if there is no answer
+Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # sends requests; raises BusError if there is no reply
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class DecisionOutcome:
 
 
 def request_decisions(ask: Ask, requests: Sequence[pb.Request], robot: Robot) -> list[DecisionOutcome]:
-    """Send one query about several robots, and return the outcome of each request, whatever goes wrong."""
+    """Send one query about several robots, and return the outcome of each request. It states what went wrong."""
     before = perf_counter_ns()
     replies: Sequence[pb.Reply | None]
     try:
@@ -64,6 +64,6 @@ def next_input(backup_plan: BackupPlan, outcome: DecisionOutcome) -> Array:
 
 
 def at_rest(backup_plan: BackupPlan) -> bool:
-    """Return whether the robot stands and its committed plan keeps it there: it can wait for the service."""
+    """Return whether the robot stands and its committed plan is to stand, so that it can wait for the service."""
     robot = backup_plan.robot
     return bool(robot.is_stop_input(backup_plan.input_in_force) and robot.is_stop_input(backup_plan.plan).all())

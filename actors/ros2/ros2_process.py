@@ -1,9 +1,9 @@
 """PROCESS: filter the raw commands of a ROS 2 robot, and drive its base by what the filter allows.
 
-Periods follow each other by the robot's clock. At the beginning of a period its input goes out, and again every
-`RESEND` seconds. `lead` seconds before its end, the process asks about the newest raw command. The answer's input, or
-without an answer the committed plan's, is for the next period. If an input of the decision is missing or stale, the
-robot brakes along the committed plan. If this process dies, the base's own timeout brakes.
+Periods follow each other by the robot's clock. The process sends the input of a period at its beginning, and again
+every `RESEND` seconds. `lead` seconds before the period ends, it asks for a decision on the newest raw command. The
+next period gets the input of the answer. If there is no answer, or if a measurement or command that a decision needs
+is missing or stale, the robot brakes along the committed plan. If this process dies, the base's own timeout brakes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ log = logging.getLogger("brakeline.ros2")
 
 RESEND = 0.05  # s after which an input is sent again
 SILENCE = 0.5  # s for which a simulation's clock may stand still
-LATE = 0.02  # s: a period that begins later than this after its time is late
+LATE = 0.02  # s after its due time: a period that begins later is late
 DIAGNOSTICS_INTERVAL = 1.0  # s between two diagnostics, unless the decision changes
 
 
@@ -89,10 +89,10 @@ class FilterNode:
     """The node of one robot, and the loop over its periods."""
 
     def __init__(self, settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> None:
-        """Set up the gate, the clock and the inputs. tap: called with every message.
+        """Set up the gate, the clock and the inputs, and join the graph. tap: called with every message.
 
         Raises:
-            Unreachable, BadRosName, UnknownRobot, Mismatch: with what to do.
+            Unreachable, BadRosName, UnknownRobot, Mismatch: the message says what to do.
         """
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)
@@ -132,7 +132,7 @@ class FilterNode:
         return self.gate.stats.figures() | {"passed over": self.node.rejected.count}
 
     def _first_period(self) -> float:
-        """Return when the first period begins [s]: at a multiple of its length, as all periods do."""
+        """Return when the first period begins [s]. All periods begin at multiples of their length."""
         while self.clock.now() == 0.0 and not self._stop.is_set():  # a simulation that has not sent its time yet
             self.clock.wait(1e-6, self._stop, SILENCE)
         self.clock.jumped()
@@ -198,7 +198,7 @@ class FilterNode:
         topics = self.settings.topics
         if others := self._commanders.nodes():
             raise InputMissing(
-                f"{', '.join(others)} publishes on {topics.command} too, which no filter checks: let it publish on "
+                f"{', '.join(others)} publishes on {topics.command} too, past the filter: let it publish on "
                 f"{topics.raw}"
             )
         if self.inputs.command(now) is None and (others := self._senders.of_other_type(self._twist)):
@@ -208,7 +208,7 @@ class FilterNode:
     def _resend_until(self, moment: float, stop: threading.Event) -> bool:
         """Wait for a moment [s], and send the input in force again meanwhile. Return False as `SystemClock.wait` does.
 
-        In a simulation nothing is sent again: a simulation may wait for the next command.
+        In a simulation, the process sends no input again, because each command may start the simulation's next step.
         """
         clock = self.clock
         while not self.settings.sim_time and moment - clock.now() > RESEND:

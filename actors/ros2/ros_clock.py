@@ -9,6 +9,7 @@ from brakeline.messaging.ros2.cdr_messages import Clock, seconds
 
 JUMP = 0.05  # s: a smaller difference to the system time counts as drift
 POLL = 0.02  # s between two checks whether to stop
+ROUNDING = 1e-9  # s
 
 
 class SystemClock:
@@ -60,7 +61,7 @@ class RosSimulatedClock(SystemClock):
     def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
         with self._moved:
             last, since = self._now, time.monotonic()
-            while self._now < moment - 1e-9 and not self._jump:
+            while self._now < moment - ROUNDING and not self._jump:
                 self._moved.wait(POLL)
                 if self._now != last:
                     last, since = self._now, time.monotonic()

@@ -200,7 +200,7 @@ def test_a_node_that_commands_the_base_past_the_filter_stops_the_robot_until_it_
         robot.drives()
         with RosNode(node_under_test.node.settings, "teleop") as other:
             other.publisher("cmd_vel", cdr.TwistStamped)  # whatever its type is
-            robot.stops("/r/teleop publishes on cmd_vel too, which no filter checks: let it publish on cmd_vel_raw")
+            robot.stops("/r/teleop publishes on cmd_vel too, past the filter: let it publish on cmd_vel_raw")
         robot.drives()
 
 
