@@ -36,7 +36,7 @@ class GraphOptions:
     """Put the node into this namespace."""
 
     def settings(self, connect: tuple[str, ...], listen: tuple[str, ...] = ()) -> RosSettings:
-        """Return how to reach the graph at these endpoints. Raises ValueError if the domain is not a number from 0."""
+        """Return how to reach the graph at these endpoints. Raises ValueError: the domain is no whole number from 0."""
         from brakeline.messaging.ros2 import RosSettings
 
         text = os.environ.get("ROS_DOMAIN_ID") or "0" if self.domain is None else str(self.domain)

@@ -1,6 +1,6 @@
 """Import recordings as a data set: choose a reader by the file's kind, then resample to the robot's period.
 
-Brakeline's own logs are sampled at the period already, so that no resampling is needed.
+Brakeline's own logs have one sample in each period, so the import does not resample them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.repeated_driving import repeated_driving
 
-BAG_ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap.zstd")  # besides .mcap, which logs of runs share
+BAG_ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap.zstd")  # and .mcap, unless it is a log of a run
 BAG, PARQUET, JSON, OWN = "ros_bag:read", "parquet_files:read", "json_lines:read", "a log of a run"
 READERS = {
     ".csv": "csv_file:read",
@@ -39,7 +39,7 @@ READERS = {
     ".ulg": "px4_log:read",
 }
 KINDS = f"{', '.join(READERS)}, .mcap (a bag, or a log of a run), and folders of bags, of Parquet files and of runs"
-ALL_STEPS = 1_000_000  # of a Brakeline log
+MOST_STEPS = 1_000_000  # of a log of a run; an import takes the last ones
 
 
 def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
@@ -53,18 +53,20 @@ def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
     """
     reader = reader_of(path)
     if reader == OWN:
-        raise NoSource(f"{path} is a log of a run: it has no tables")
+        raise NoSource(f"{path} is a log of a run, which has no tables: give a log of another program")
     return with_time(read_isolated(reader, path, options.limits), path, options)
 
 
 def with_time(tables: list[Table], path: Path, options: LogOptions) -> list[Table]:
     """Return tables with their time, their source and the ranks that the user chose. Raises NoSource."""
     column, unit = options.fields.get(TIME, ""), options.units.get(TIME, "")
-    tables = [
-        replace(t if t.name else with_message_fields(stamped(in_header_units(t), column, unit)), source=path.name)
-        for t in tables
-    ]
-    return options.ranked(tables)
+
+    def timed(table: Table) -> Table:
+        if table.name:  # a topic or a type of messages: the reader has set its time
+            return table
+        return with_message_fields(stamped(in_header_units(table), column, unit))
+
+    return options.ranked([replace(timed(table), source=path.name) for table in tables])
 
 
 def reader_of(path: Path) -> str:
@@ -81,7 +83,8 @@ def reader_of(path: Path) -> str:
             return BAG
         if any(path.rglob("*.parquet")):
             return PARQUET
-        return OWN if not (logs := list(path.glob("*.mcap"))) or not is_ros(logs[0]) else BAG
+        logs = list(path.glob("*.mcap"))
+        return BAG if logs and is_ros(logs[0]) else OWN
     if not path.is_file():
         raise NoSource(f"{path} is neither a file nor a folder")
     name = path.name.lower()
@@ -124,7 +127,8 @@ def import_sources(
     samples = {report.samples for report in reports}
     if len(samples) > 1:
         raise NoSource(
-            f"the sources have different numbers of positions per period ({samples}): import them one by one"
+            f"the sources have different numbers of positions in a period ({', '.join(map(str, sorted(samples)))}): "
+            "import them one by one"
         )
     data = Dataset(
         robot,
@@ -175,7 +179,7 @@ def _refuse_copies(paths: Sequence[Path], parts: Sequence[ImportedData]) -> None
 
 def _import_one(path: Path, robot: Robot, options: LogOptions, delay: float, hold: float) -> ImportedData:
     if own_log(path):
-        data, note = from_log(path, robot, ALL_STEPS)
+        data, note = from_log(path, robot, MOST_STEPS)
         samples = data.trajectories[0].paths.shape[1]
         return ImportedData(data, ImportReport(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (note,)))
     try:

@@ -1,4 +1,4 @@
-"""Compare the measurement errors of a description with a log: how far a measured pose moves while the robot stands."""
+"""Compare the measurement errors that a description states with how much the pose in a log varies at rest."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from brakeline.deploy.data.sources.quantity_names import column_names, column_un
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Trajectory
 
-STOOD = 2.0  # s without an input, or the periods of a plan, after which a robot stands
-FEWEST = 20  # periods of standing that show the noise
+STOOD = 2.0  # s without an input, and at least the length of a plan, after which a robot stands
+FEWEST = 20  # periods at rest; fewer of them do not show the noise
 
 
 def small_errors(robot: Robot, parts: Sequence[Trajectory]) -> list[str]:
@@ -29,15 +29,16 @@ def small_errors(robot: Robot, parts: Sequence[Trajectory]) -> list[str]:
     pose = [*range(robot.position_dim), *([] if robot.heading is None else [robot.heading])]
     return [
         f"{names[i]} varies by ±{noise[i]:.2g} {units[names[i]]} while the robot stands, but the description states "
-        f"`error = {robot.measurement_bound[i]:g}`: write the largest difference from the true value"
+        f"`error = {robot.measurement_bound[i]:g}`: write the largest difference from the true value as its error"
         for i in pose
         if noise[i] > robot.measurement_bound[i]
     ]
 
 
 def _moved_at_rest(robot: Robot, t: Trajectory, rest: int) -> Array:
-    """Return the changes of the states (n, d) in the periods that follow `rest` periods without an input."""
-    idle = np.concatenate([[0], np.cumsum(robot.is_stop_input(t.inputs))])
-    at = np.arange(rest, len(t.inputs))
+    """Return the changes of the states (k, n) in periods without an input, after `rest` periods without one."""
+    idle_before = np.concatenate([[0], np.cumsum(robot.is_stop_input(t.inputs))])  # number of such periods
+    periods = np.arange(rest, len(t.inputs))
+    at_rest = idle_before[periods + 1] - idle_before[periods - rest] == rest + 1
     changes: Array = np.diff(t.states, axis=0)
-    return np.asarray(changes[at[idle[at + 1] - idle[at - rest] == rest + 1]])
+    return np.asarray(changes[periods[at_rest]])

@@ -1,8 +1,8 @@
 """Evaluate a network on many simulated robots at once.
 
-The episodes are those of an evaluation one by one: the same arenas, noise and starts. Decisions are those of the batch
-filter, which agree with single ones to within 1e-6 of an input, so long episodes may end a period earlier or later. A
-decision has no time of its own; its time is the batch's, divided by its robots.
+The episodes have the same arenas, noise and starts as in an evaluation one by one. The inputs that the batch filter
+decides on differ by at most 1e-6 from those of the filter for one robot, so a long episode may end a period earlier or
+later. The time of a decision is the time of the batch, divided by the number of its robots.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Evaluation
 
 MOST_ROBOTS = 128
-TURNS = 8  # episodes of each robot: while the last ones end, the others drive for nothing
+TURNS = 8  # episodes of each robot: with fewer, most driving would be for nothing while the last episodes end
 ONE_BY_ONE = "evaluate without --backend batch"
 
 
@@ -42,7 +42,7 @@ def drive_batch(
 ) -> None:
     """Drive the episodes of an evaluation: see `drive_episodes`.
 
-    independent: each episode begins without a widening. Otherwise a robot keeps it from one episode to the next.
+    independent: each episode begins without a widening. Otherwise, a robot's widening goes on in its next episode.
 
     Raises:
         NoBatch: this robot, policy, method, arena or fleet can only be evaluated one by one.
@@ -70,7 +70,7 @@ def drive_episodes(
     begin: Callable[[pb.Episode], object] = lambda message: None,
     **others: Any,
 ) -> None:
-    """Drive the episodes with these numbers; whichever robot is free begins the next one.
+    """Drive the episodes with these numbers: a robot whose episode has ended begins the next one.
 
     A robot that finds no episode left drives one that does not count, until all others have ended.
 
@@ -107,7 +107,7 @@ def drive_episodes(
 
 
 def batch_filter(robot: RobotWithTask, evaluation: Evaluation) -> BatchMethod | None:
-    """Return what decides, or None for the method `none`. Raises NoBatch if no batch has this policy or fleet."""
+    """Return the filter or rival; None for the method `none`. Raises NoBatch: no batch has this policy or fleet."""
     if evaluation.fleet:
         raise NoBatch(f"robots of a fleet see each other, which no batch simulates: {ONE_BY_ONE}")
     name = evaluation.policy

@@ -44,13 +44,21 @@ from brakeline.safety.rivals.own_code import OwnCode
 from brakeline.safety.rivals.pretrained import Pretrained
 
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
-COUNTED = {"goals": "goal", "timeouts": "timeout", "contacts_moving": "contact_moving"}
-COUNTED["contacts_standing"] = "contact_standing"  # figures of a log, and the columns that count the same
+# Figures of a log, and the columns of the table of episodes that count the same.
+COUNTED = {
+    "goals": "goal",
+    "timeouts": "timeout",
+    "contacts_moving": "contact_moving",
+    "contacts_standing": "contact_standing",
+}
 LOGGED = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
 
 
 def progress(table: EpisodeTable) -> str:
-    """Say how far a training is. The first episodes to end are the shortest, so a share alone would mislead."""
+    """Return the number of steps so far, and the goals of the last episodes, as a line.
+
+    The line states how many episodes these are: the first ones to end are the shortest, so a share would mislead.
+    """
     goals = [row["goal"] for row in table.rows[-50:]]
     return f"step {table.decisions}, {sum(goals):g} of the last {len(goals)} episodes reached the goal"
 
@@ -58,7 +66,7 @@ def progress(table: EpisodeTable) -> str:
 class CellRun:
     """The run of one cell in a folder.
 
-    seed_key: of the episodes that evaluate it.
+    seed_key: seeds the episodes of the evaluations.
     """
 
     def __init__(self, cell: CellConfig, folder: Path, say: Report, seed_key: int = FRESH) -> None:
@@ -116,7 +124,7 @@ class CellRun:
         return train_in_lockstep(driver, ask, learner, take, begin), learner.updates
 
     def _train_batch(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
-        """Train with many robots at once, as `_train_single` returns it."""
+        """Train with many robots at once. Return what `_train_single` returns."""
 
         def publish(number: int, message: pb.Step | pb.Episode) -> None:
             if isinstance(message, pb.Step):
@@ -134,7 +142,7 @@ class CellRun:
             arena=trial.arena,
             seed=cell.seed,
             penalty=cell.penalty,
-            ends_on_intervention=_cuts(trial),
+            ends_on_intervention=_ends_on_intervention(trial),
         )
         try:
             while not learner.done:
@@ -146,7 +154,7 @@ class CellRun:
         return decode(learner.weights().file, self.robot), learner.updates
 
     def _train_sac(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
-        """Train another learner with many robots at once, as `_train_single` returns it."""
+        """Train SAC with many robots at once. Return what `_train_single` returns."""
         from brakeline.deploy.experiments.sac_training import train_sac  # Stable-Baselines3 is an extra
 
         return train_sac(self.robot, self._safety(trial), self.cell, take, begin)
@@ -180,7 +188,7 @@ class CellRun:
         return table
 
     def _safety(self, trial: TrialConfig) -> BatchMethod | None:
-        """Return what decides for a batch; None for the method `none`."""
+        """Return the filter or rival that decides for a batch; None for the method `none`."""
         return None if trial.method == NONE else batch_method(self.models[trial.method])
 
     def _driver(self, trial: TrialConfig, seed: int, actor: str) -> tuple[EpisodeRunner, Ask | None]:
@@ -192,7 +200,7 @@ class CellRun:
             ActorIdentity(actor, 0, self.cell.seed),
             penalty=self.cell.penalty,
             filtered=ask is not None,
-            ends_on_intervention=_cuts(trial),
+            ends_on_intervention=_ends_on_intervention(trial),
         )
         return driver, ask
 
@@ -205,13 +213,19 @@ class CellRun:
         return TrialLog(self.folder / f"{name}.mcap", metadata)
 
 
-def _cuts(trial: TrialConfig) -> bool:
-    """Return whether an intervention ends an episode: in SAILR's training. In an evaluation, goals must compare."""
+def _ends_on_intervention(trial: TrialConfig) -> bool:
+    """Return whether an intervention ends an episode.
+
+    It does so in SAILR's training only: in an evaluation, the goals of all methods must be comparable.
+    """
     return trial.method == SAILR and trial.policy == LEARNING
 
 
 def _cost(model: Model, robot: RobotWithTask) -> dict[str, Any]:
-    """Return the cost of pre-training, and a rival's settings. Our data come from a yard without obstacles."""
+    """Return the cost of pre-training, and a rival's settings.
+
+    The data of our filter were recorded without obstacles, so no collision was possible.
+    """
     if isinstance(model, Pretrained):
         about = {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
         source = {"obstacles": model.ready().obstacles} if isinstance(model, OwnCode) else {}

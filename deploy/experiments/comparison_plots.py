@@ -1,4 +1,4 @@
-"""Plots of a comparison: learning curves of all methods, and the value of each seed."""
+"""Plot a comparison: learning curves of all methods, performance profiles, and the rates of each seed."""
 
 from __future__ import annotations
 
@@ -17,8 +17,14 @@ from brakeline.deploy.experiments.comparison_table import WINDOW, spans
 from brakeline.logs.run_groups import METHOD_COLORS, performance_profile
 from brakeline.messaging.robot import Array
 
+PANELS = {
+    "goal": "goals reached",
+    "collision": "collisions so far",
+    "reward": "reward of an episode",
+    "interventions": "share of steps with an intervention",
+}
 POINTS = 200  # per curve
-OWN_COLORS = ("#8c564b", "#7f7f7f", "#17becf")  # of filters of your own
+OWN_COLORS = ("#8c564b", "#7f7f7f", "#17becf")  # of filters that users added to the comparison
 
 
 def _save(picture: Figure, png: Path) -> None:
@@ -37,8 +43,9 @@ def _smooth(values: Array) -> Array:
 def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
     """Return curves (seeds, POINTS) of a training figure over steps.
 
-    Collisions are summed at the ends of the episodes. Other figures are means over `WINDOW` episodes that began one
-    after the other, at the mean of their ends: in a batch, the policy changes many times within a long episode.
+    The number of collisions grows at the end of each episode. Other figures are means over `WINDOW` episodes that
+    began one after the other. A mean is drawn at the mean of their ends: in a batch, the policy changes many times
+    within a long episode.
     """
     lines = []
     for result in results:
@@ -59,12 +66,10 @@ def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
 def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
     """Plot goals, collisions, rewards and interventions over training steps: thin lines per seed, thick means."""
     picture = Figure(figsize=(10.0, 7.0), layout="constrained")
-    rows = [("goal", "goals reached"), ("collision", "collisions so far"), ("reward", "reward of an episode")]
-    rows.append(("interventions", "share of steps with an intervention"))
     panels: list[Axes] = list(picture.subplots(2, 2, sharex=True).ravel())
     steps, colors = results[0]["study"]["steps"], _colors(result["study"]["method"] for result in results)
     grid = np.linspace(0.0, steps, POINTS)
-    for axes, (name, label) in zip(panels, rows, strict=True):
+    for axes, (name, label) in zip(panels, PANELS.items(), strict=True):
         for method, color in colors.items():
             lines = _lines([result for result in results if result["study"]["method"] == method], name, grid)
             axes.plot(grid, lines.T, color=color, alpha=0.3, linewidth=0.8)
@@ -113,7 +118,7 @@ def seeds_as_points(table: dict[str, Any], png: Path) -> None:
                 axes.set_axis_off()
                 continue
             for place, (method, estimate) in enumerate(methods.items()):
-                _point(axes, place, estimate, colors[method])
+                _draw_estimate(axes, place, estimate, colors[method])
             axes.set_xticks(range(len(methods)), [compared(m).label for m in methods])
             axes.set_title(f"{part}: {name} [%]", fontsize=10)
             axes.grid(axis="y", alpha=0.3)
@@ -131,8 +136,9 @@ def _colors(methods: Iterable[str]) -> dict[str, str]:
     return {method: METHOD_COLORS.get(method) or next(others) for method in in_order(methods)}
 
 
-def _point(axes: Axes, place: int, estimate: MeanEstimate, colour: str) -> None:
-    axes.plot([place, place], [100.0 * estimate.low, 100.0 * estimate.high], color=colour, linewidth=2.0)
-    axes.plot(place, 100.0 * estimate.value, marker="_", markersize=16, color=colour)
+def _draw_estimate(axes: Axes, place: int, estimate: MeanEstimate, color: str) -> None:
+    """Draw the interval as a line, the mean as a dash, and the seeds as points side by side to the right of them."""
+    axes.plot([place, place], [100.0 * estimate.low, 100.0 * estimate.high], color=color, linewidth=2.0)
+    axes.plot(place, 100.0 * estimate.value, marker="_", markersize=16, color=color)
     offsets = place + 0.22 + 0.08 * (np.arange(len(estimate.seeds)) - 0.5 * (len(estimate.seeds) - 1))
-    axes.scatter(offsets, 100.0 * np.array(estimate.seeds), s=14, color=colour, alpha=0.7)
+    axes.scatter(offsets, 100.0 * np.array(estimate.seeds), s=14, color=color, alpha=0.7)

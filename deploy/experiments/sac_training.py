@@ -1,8 +1,9 @@
 """Train Stable-Baselines3's SAC (Haarnoja et al. 2018) from many robots at once, with or without a filter.
 
-The learner sees what any user of `BatchSafetyWrapper` has: its own proposal as the action, and the reward less the
-penalty for a correction. Rewards have the scale that our TD3 gives them, and batches hold the images of steps that ours
-have (learner/symmetry.py). The deterministic policy is a network as ours, so that the same evaluations drive it.
+The learner gets what any user of `BatchSafetyWrapper` gets: its own proposal as the action, and the reward less the
+penalty for a correction. The scale of rewards is that of our TD3. If our TD3 learns from turned and mirrored steps
+(learner/symmetry.py), so does SAC. The deterministic policy is a network of the same kind as ours, so the same
+evaluations can drive it.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ CAPACITY = 200_000  # steps of the replay buffer, as our learner's
 class ImagesReplayBuffer(NStepReplayBuffer):
     """The n-step buffer of Stable-Baselines3, whose batches hold the images of steps in a turned or mirrored world.
 
-    Its actions are in shares of their ranges. Axes that change places have equal ranges, and none that changes its sign
-    has another range to its other side. So the images of these are the shares of the images.
+    The buffer stores actions that Stable-Baselines3 scaled to [-1, 1]. The image of a scaled action is the scaled image
+    of the action, because inputs that change places have equal ranges, and the range of an input that changes its sign
+    is symmetric about zero.
     """
 
     def __init__(self, *args: Any, images: SymmetryAugmentation, **kwargs: Any) -> None:
@@ -45,8 +47,8 @@ class ImagesReplayBuffer(NStepReplayBuffer):
 
     def _get_samples(self, batch_inds: NDArray[np.intp], env: Any = None) -> ReplayBufferSamples:
         samples = super()._get_samples(batch_inds, env)
-        turned = ("observations", "actions", "next_observations")
-        return samples._replace(**{name: self._image(getattr(samples, name)) for name in turned})
+        names = ("observations", "actions", "next_observations")
+        return samples._replace(**{name: self._image(getattr(samples, name)) for name in names})
 
     def _image(self, rows: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(self._images.rows(rows.numpy()))
@@ -110,8 +112,8 @@ def train_sac(
     """Train the policy of a cell in its first arena, and return it with the number of updates.
 
     Args:
-        safety: decides; None: each robot executes what it proposes.
-        cell: its settings of TD3 are those that SAC shares with it; the learning rate is the actor's.
+        safety: the filter or rival. None: each robot executes what it proposes.
+        cell: gives the settings. SAC uses the settings of TD3 that it has too, and the learning rate of the actor.
         take, begin: called with each step, and with the description of each episode.
     """
     torch.set_num_threads(1)
@@ -148,7 +150,7 @@ def train_sac(
 
 
 def _buffer(robot: RobotWithTask, config: TD3Config) -> dict[str, Any]:
-    """Return the options of SAC for n-step returns, and for images of steps if our learner has them."""
+    """Return the options of SAC for n-step returns, and for images of steps if our learner uses images."""
     if not config.symmetric or robot.task.symmetry == "none":
         return {"n_steps": config.n_step}
     images = SymmetryAugmentation(robot, config.batch)

@@ -1,7 +1,8 @@
 """Search for the episodes in which the filter keeps the least distance: CMA-ES over obstacles and proposed inputs.
 
-A candidate moves the obstacles next to the start, and says which inputs the policy proposes, piece by piece. Its score
-is the least true distance between the robot and any obstacle. The search knows the simulator, which no policy does.
+A candidate moves the obstacles next to the start, and lists the inputs that the policy proposes one after the other.
+Its score is the least true distance between the robot and any obstacle. So the search uses the true state of the
+simulator, which no policy gets.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ MOVED = 6  # obstacles that a candidate moves
 PIECES = 10  # constant inputs that the policy proposes one after the other
 PERIODS = 60  # of an episode
 EPISODES_OF_AN_ARENA = 300  # candidates in one drawn arena, before the next one is drawn
-MOST_ARENAS = 10  # arenas without an episode that counts, after which the search ends
-SPREAD = 0.5  # first standard deviation of a candidate's numbers, which are used within -1 and 1
+MOST_ARENAS = 10  # the search gives up after so many arenas without an episode that counts
+SPREAD = 0.5  # initial standard deviation of a candidate's numbers, each of which is within -1 and 1
 MOST_SHIFT = 4.0  # largest shift of an obstacle, in radii of the robot's footprint
 CONTACT_BONUS = 1.0  # m, subtracted from the score of a candidate with a contact, so that it is below all others
+NOT_COUNTED = 10.0  # m, score of an episode that does not count, so that it is above all others
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class SearchedEpisode:
         return replace(drawn, obstacles=obstacles, step_limit=PERIODS)
 
     def policy(self, robot: Robot) -> Policy:
-        """Return the policy that proposes the inputs, each for the same time."""
+        """Return the policy that proposes the inputs one after the other, each for the same time."""
         pieces = self.values[-PIECES * robot.action_dim :].reshape(PIECES, robot.action_dim)
         low, high = robot.low(), robot.high()
         inputs = low + 0.5 * (pieces + 1.0) * (high - low)
@@ -77,9 +79,12 @@ class SearchedEpisode:
 def search(
     robot: RobotWithTask, evaluation: Evaluation, episodes: int, path: Path, say: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Search for so many episodes, and write the log of the worst one.
+    """Drive as many episodes as given, and write the log of the worst one.
 
-    evaluation: gives arena, method, model set, conditions and seed.
+    Args:
+        evaluation: gives arena, method, model set, conditions and seed.
+        path: of the log.
+        say: called with the progress, after each generation of candidates.
 
     Returns:
         `episodes`, `collisions`, `steps`, `closest` [m], `number` and `values` of the worst candidate, and `history`
@@ -97,7 +102,7 @@ def search(
         options = {
             "bounds": [-1.0, 1.0],
             "seed": evaluation.seed + number + 1,
-            "verbose": -9,
+            "verbose": -9,  # prints nothing
             "maxfevals": EPISODES_OF_AN_ARENA,
         }
         strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
@@ -107,7 +112,10 @@ def search(
             say(f"{progress.episodes} of {episodes} episodes, closest {1e3 * progress.closest:.1f} mm")
         number += 1
         if not progress.episodes and number == MOST_ARENAS:
-            raise NoArena(f"every candidate in {number} arenas {evaluation.arena!r} began too near to something")
+            raise NoArena(
+                f"every candidate in {number} arenas {evaluation.arena!r} began too near to something: choose another "
+                "arena, or increase its start_clearance"
+            )
     progress.write_worst(path)
     return progress.figures()
 
@@ -137,11 +145,11 @@ class _Search:
         return self._driver.row(candidate.number, log, candidate.policy(self._robot)), arena
 
     def score(self, candidate: SearchedEpisode) -> float:
-        """Drive a candidate and return what CMA-ES makes small."""
+        """Drive a candidate and return its score, which CMA-ES minimizes."""
         row, arena = self._drive(candidate)
         free = float(arena.shapes.distance(np.asarray(arena.start[: arena.dim])).min()) - self._robot.footprint
         if free < self._robot.footprint:  # it began too near to something: no fault of the filter
-            return 10.0 - free
+            return NOT_COUNTED - free
         self.episodes, self._steps = self.episodes + 1, self._steps + int(row["steps"])
         touched = bool(row["collision"] or row["contact_moving"])
         self._collisions += touched
@@ -172,6 +180,6 @@ class _Search:
 
 
 def _movable(obstacle: Obstacle, arena: Arena) -> bool:
-    """Return whether this is no floor or ceiling."""
-    (low, high) = arena.bounds[0]
+    """Return whether an obstacle is smaller than the arena, as all obstacles but its floor and ceiling are."""
+    low, high = arena.bounds[0]
     return not obstacle.size or max(obstacle.size) < high - low

@@ -1,4 +1,4 @@
-"""PROCESS: the certifier. It hears all robots, and publishes a new model set when they have changed (`Adaptation`)."""
+"""PROCESS: the certifier. It receives the steps of all robots, and publishes a new model set after they changed."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from brakeline.safety.service.signature import ModelSigner
 
 log = logging.getLogger("brakeline.certifier")
 
-PERIOD = 0.5  # s between two looks at the messages
-MOST_TAKING = 10.0  # s in which it takes in the messages that waited during a fit
+PERIOD = 0.5  # s between two checks for messages
+MOST_TAKING = 10.0  # s, the longest time in which it takes in the messages that waited during a fit
 START_ALLOWANCE, TERMINATION_TIMEOUT = 60.0, 10.0  # s, of a certifier beside a safety service
 NOTE = "adaptation"  # of Health, with the robot's name: the result of the last attempt
 
@@ -74,13 +74,13 @@ def main(settings: CertifierSettings) -> None:
         process.announce()
         log.info("ready")
         process.stop.wait()
-    _leave(worker)
+    _end(worker)
 
 
-def _leave(worker: threading.Thread) -> None:
+def _end(worker: threading.Thread) -> None:
     """Wait for the worker. If it is in a fit, end the process at once.
 
-    While compiled code still runs, the interpreter's own end can abort the process, and prints what the code leaks.
+    If the interpreter shut down while compiled code runs, it could abort the process and print what the code leaks.
     """
     worker.join(PERIOD)
     if worker.is_alive():
@@ -102,7 +102,7 @@ def _run(inbox: Inbox, kinds: dict[str, Adaptation], signer: ModelSigner, proces
         take_in = partial(_take_in, inbox, kinds, process)
         take_in()
         for kind in kinds.values():
-            _follow(kind, take_in, signer, process)
+            _attempt_if_due(kind, take_in, signer, process)
 
 
 def _take_in(inbox: Inbox, kinds: dict[str, Adaptation], process: Process) -> None:
@@ -116,16 +116,16 @@ def _take_in(inbox: Inbox, kinds: dict[str, Adaptation], process: Process) -> No
                 kinds[message.request.robot].exchange(message, time.monotonic())
 
 
-def _follow(kind: Adaptation, take_in: Callable[[], None], signer: ModelSigner, process: Process) -> None:
-    """Make an attempt for a robot kind, if it is time. An error ends the attempt, and nothing else.
+def _attempt_if_due(kind: Adaptation, take_in: Callable[[], None], signer: ModelSigner, process: Process) -> None:
+    """Make an attempt for a robot kind, if it is due. An error ends the attempt, and nothing else.
 
-    take_in: gives the received messages to the kinds; after a fit they say whether another set came into use.
+    take_in: gives the received messages to the kinds. After a fit, they show whether another set came into use.
     """
     name = kind.robot.name
     try:
         if (attempt := kind.attempt()) is not None:
             take_in()
-            _settle(kind.confirmed(attempt), kind.robot, signer, process)
+            _report_result(kind.confirmed(attempt), kind.robot, signer, process)
         _report_progress(kind, process)
         process.figures[f"widening {name}"] = kind.widening
         process.figures[f"minutes since the change {name}"] = kind.since_change
@@ -135,7 +135,7 @@ def _follow(kind: Adaptation, take_in: Callable[[], None], signer: ModelSigner, 
 
 
 def _report_progress(kind: Adaptation, process: Process) -> None:
-    """Say how much driving since a change is missing, in place of the last attempt's note; log begin and end."""
+    """Note how much driving since a change is missing, in place of the last attempt's note; log begin and end."""
     note, progress, name = f"{NOTE} {kind.robot.name}", kind.progress, kind.robot.name
     waited = process.notes.get(note, "").startswith(WAITING)
     if progress:
@@ -148,8 +148,8 @@ def _report_progress(kind: Adaptation, process: Process) -> None:
     process.figures[f"plans needed {name}"] = float(kind.plans_needed)
 
 
-def _settle(attempt: Recertification, robot: Robot, signer: ModelSigner, process: Process) -> None:
-    """Publish the model set of an attempt, if it has one, and say so."""
+def _report_result(attempt: Recertification, robot: Robot, signer: ModelSigner, process: Process) -> None:
+    """Note and log the result of an attempt. Publish its model set, if it has one."""
     process.notes[f"{NOTE} {robot.name}"] = attempt.text
     count = f"{'refused' if attempt.model is None else 'published'} {robot.name}"
     process.figures[count] = process.figures.get(count, 0.0) + 1.0
@@ -166,7 +166,7 @@ def _settle(attempt: Recertification, robot: Robot, signer: ModelSigner, process
 def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
     """Run the certifier in a process of its own until the end of the block, or of this process.
 
-    settings: with the bus of this process, which may be a router.
+    settings: their `bus` is that of this process, which may be a router.
     """
     bus = settings.bus
     here = tuple(endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in bus.listen)
@@ -186,9 +186,9 @@ def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
 
 
 def _report_end(sentinel: int, leaving: threading.Event) -> None:
-    """Say so if a certifier ends before the service beside it does: nothing starts it again.
+    """Log an error if a certifier ends before the service beside it does: nothing starts it again.
 
-    ^C in a terminal reaches both, and the service takes longer to leave.
+    ^C in a terminal reaches both, and the service takes longer to end. So wait before you log.
     """
     connection.wait([sentinel])
     if not leaving.wait(TERMINATION_TIMEOUT):
@@ -198,7 +198,7 @@ def _report_end(sentinel: int, leaving: threading.Event) -> None:
 def _start_beside(settings: CertifierSettings) -> None:
     if not end_with_spawner():
         return
-    os.nice(10)
+    os.nice(10)  # decisions of the service come first
     try:
         main(settings)
     except BrakelineError as error:

@@ -17,7 +17,7 @@ from brakeline.deploy.data.certification import certify, certify_update
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run import adaptation, adaptation_process
 from brakeline.deploy.run.adaptation import NARROWER, REQUESTS, UPDATED, Adaptation, Recertification
-from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
+from brakeline.deploy.run.adaptation_process import CertifierSettings, _attempt_if_due, certifier_beside
 from brakeline.deploy.run.processes import UNFINISHED
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
 from brakeline.errors import BadModel, BadStep, Implausible, Untrusted
@@ -295,17 +295,17 @@ def test_the_certifier_says_how_much_driving_is_missing(kind):
     process = SimpleNamespace(notes={}, figures={}, announce=lambda: None)
     trajectories = driven(2, 7, slip=-0.15)
     drive(kind, trajectories[:1])
-    _follow(kind, lambda: None, None, process)
+    _attempt_if_due(kind, lambda: None, None, process)
     assert not process.notes
     drive(kind, trajectories[1:4], widening=8.0, first=1)
-    _follow(kind, lambda: None, None, process)
+    _attempt_if_due(kind, lambda: None, None, process)
     plans = int(process.figures[f"plans since the change {ROBOT.name}"])
     assert plans == 3 * ((EPISODE - 1) // ROBOT.horizon), "an episode's first step is the start of a trajectory"
     note = process.notes[f"adaptation {ROBOT.name}"]
     assert f"waiting: {plans} of the {kind.plans_needed} plans since the change that state 3 %" in note
     assert f"{max(2.0, 2.0 * (kind.plans_needed - plans) / plans):.1f} minutes left" in note, "four at least"
     drive(kind, trajectories[4:5], first=4)
-    _follow(kind, lambda: None, None, process)
+    _attempt_if_due(kind, lambda: None, None, process)
     assert not process.notes, "the change is over"
 
 
@@ -385,10 +385,10 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     attempts = [None, Recertification("why", in_use(), data, "old"), Recertification("no")]
     attempt = Mock(side_effect=[ZeroDivisionError("one of these"), *attempts])
     monkeypatch.setattr(kind, "attempt", attempt)
-    _follow(kind, lambda: None, signer, process)
+    _attempt_if_due(kind, lambda: None, signer, process)
     assert "one of these" in process.notes[f"adaptation {ROBOT.name}"] and "no new model set" in caplog.text
     for _ in range(3):
-        _follow(kind, lambda: None, signer, process)
+        _attempt_if_due(kind, lambda: None, signer, process)
     ((topic, message),) = published
     assert topic is MODEL
     signed = SignedModel(message.file, message.claim, message.signature)
@@ -401,7 +401,7 @@ FITTING = """
 import threading
 import numpy as np
 from proxsuite import proxqp
-from brakeline.deploy.run.adaptation_process import _leave
+from brakeline.deploy.run.adaptation_process import _end
 
 def fit():
     while True:
@@ -413,7 +413,7 @@ def fit():
 begun, worker = threading.Event(), threading.Thread(target=fit, daemon=True)
 worker.start()
 begun.wait()
-_leave(worker)
+_end(worker)
 """
 
 
