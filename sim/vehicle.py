@@ -66,7 +66,7 @@ class Vehicle(Protocol):
         """Change the vehicle's physics from now on; each kind of vehicle documents the names that it takes.
 
         Raises:
-            ValueError: the vehicle cannot change what has this name, or not to this value.
+            ValueError: the vehicle has nothing with this name to change, or the value is out of range.
         """
 
 

@@ -15,7 +15,7 @@ from brakeline.safety.filter.batch.dual_active_set import BatchSolution, solve_b
 from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.qp import ROW_TIGHTENING, QPBuilder
 
-ROUNDING = 1e-9  # m: the order in which numbers are added may decide a comparison of values that are nearer
+ROUNDING = 1e-9  # m: for values nearer to each other, the order of the sums may decide their comparison
 
 
 class RowBatch(NamedTuple):
