@@ -138,7 +138,7 @@ def show_episode(episode: Figures) -> RenderableType:
 def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
     """Yield a name and a value of each figure of one run."""
     episodes, steps = figures["episodes"], figures["steps"]
-    within = figures.get("intervals") or {}
+    intervals = figures.get("intervals") or {}
     setup = [f"{name} {figures[name]}" for name in (*SETUP, "model") if figures.get(name) is not None]
     if setup:
         yield "configuration", ", ".join(setup)
@@ -151,11 +151,12 @@ def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
         yield "goals, collisions, rewards", NOT_STATED
     ends = ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts")
     for name in ends if has_outcomes else ():
-        text, interval = share(figures[name], episodes, within.get(name)), within.get(name)
+        interval = intervals.get(name)
+        text = share(figures[name], episodes, interval)
         if name == RUN_INTO:  # an episode may have several, so the interval is that of their mean number
             text = f"{figures[name]}" + known(", 95 %: {0[0]:.2g} to {0[1]:.2g} in an episode", interval)
         yield name.replace("_", " "), text
-    interventions = share(figures["interventions"], steps, within.get("interventions"))
+    interventions = share(figures["interventions"], steps, intervals.get("interventions"))
     yield "interventions", f"{interventions}, {figures['failsafes']} of them failsafe"
     yield "adjusted", share(figures["adjusted"], steps)
     yield "adjusted for clearance", for_clearance(figures)
@@ -163,7 +164,7 @@ def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
     yield "speed", known("{:.3f} m/s", mean) + known(", at most {:.3f} m/s", most)
     yield "closest approach", known("{:.3f} m, to fixed obstacles", figures.get("closest_approach"))
     containment = figures["containment"]
-    outside = share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
+    outside = share(containment["violations"], containment["steps"], intervals.get("violations"), digits=3)
     yield "outside the predicted set", outside
     if figures["recovering"]:
         yield "recovering", share(figures["recovering"], steps)
@@ -316,10 +317,10 @@ def _processes(processes: Figures) -> Table:
     return plain_table(("process", "starts", "alive, s", "messages/s", "silences", "ended"), rows)
 
 
-def share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:
+def share(count: int, of: int, interval: list[float] | None = None, digits: int = 1) -> str:
     """Format a count with its share, and the interval of the share if it is known."""
     text = f"{count}" + (f" ({count / of:.{digits}%})" if of else "")
-    return text + (f", 95 %: {within[0]:.{digits}%} to {within[1]:.{digits}%}" if within is not None else "")
+    return text + (f", 95 %: {interval[0]:.{digits}%} to {interval[1]:.{digits}%}" if interval is not None else "")
 
 
 def known(form: str, value: Any, otherwise: str = "") -> str:

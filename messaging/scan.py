@@ -108,7 +108,7 @@ class Scan(ComparedByValue):
         position_error: largest error of the pose's position [m].
         heading_error: largest error of the pose's heading [rad].
         least_width: see above [m].
-        doubt: number of beams on either side that must agree that space is free, against single false ranges.
+        doubt: number of beams on either side that must agree that space is free, so that one false range has no effect.
         speed: largest speed of the surfaces that were hit [m/s]; 0: the world is static.
         age: time since the scan [s].
         acceleration: largest acceleration of moving obstacles [m/s²]; 0: unknown.

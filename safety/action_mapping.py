@@ -66,14 +66,16 @@ def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMa
         f"{name} from {low:g} to {high:g}"
         for name, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True)
     )
-    give = "give actions=ActionMapping(action_to_control, control_to_action)"
+    argument = "actions=ActionMapping(action_to_control, control_to_action)"
     if not isinstance(space, gymnasium.spaces.Box) or space.shape != (robot.action_dim,):
-        raise Mismatch(f"the action space {space} is not that of {robot.name}'s inputs ({inputs}): {give}")
+        raise Mismatch(f"the action space {space} is not that of {robot.name}'s inputs ({inputs}): give {argument}")
     near = SAME_BOUND * (robot.high() - robot.low())
     if (np.abs(space.low - robot.low()) > near).any() or (np.abs(space.high - robot.high()) > near).any():
         if (space.low == -1.0).all() and (space.high == 1.0).all():
-            give = f"give actions=normalised(robot) if ±1 stands for the bounds, else {give.removeprefix('give ')}"
-        raise Mismatch(f"the action space {space} has other bounds than {robot.name}'s inputs ({inputs}): {give}")
+            argument = f"actions=normalised(robot) if ±1 stands for the bounds, else {argument}"
+        raise Mismatch(
+            f"the action space {space} has other bounds than {robot.name}'s inputs ({inputs}): give {argument}"
+        )
     return IDENTITY
 
 

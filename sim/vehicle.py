@@ -66,7 +66,7 @@ class Vehicle(Protocol):
         """Change the vehicle's physics from now on; each kind of vehicle documents the names that it takes.
 
         Raises:
-            ValueError: the vehicle cannot change what has this name, or not to this value.
+            ValueError: the vehicle has nothing with this name to change, or the value is out of range.
         """
 
 
@@ -116,8 +116,8 @@ class SimulatedVehicle:
         """
         setters = self.setters()
         if unknown := changes.keys() - setters.keys():
-            names = ", ".join(setters) or "nothing that can change"
-            raise ValueError(f"a {self.robot.kind} has no {', '.join(sorted(unknown))}; it has: {names}")
+            names = ", ".join(setters) or "nothing"
+            raise ValueError(f"{self.robot.kind}: cannot change {', '.join(sorted(unknown))}; can change: {names}")
         for name, value in changes.items():
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} must be finite and 0 or more, not {value}")

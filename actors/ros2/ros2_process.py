@@ -72,7 +72,7 @@ class Ros2Settings:
 
 
 def driven(name: str) -> Robot:
-    """Return the robot of this name in real time.
+    """Return the robot with this name, described in real time.
 
     Raises:
         UnknownRobot: there is none.
@@ -81,7 +81,10 @@ def driven(name: str) -> Robot:
     robot = robot_maybe_with_task(name)
     robot = robot if robot.late else robot.in_real_time()
     if (robot.position_dim, robot.heading, robot.state_dim, robot.action_dim) != (2, 2, 5, 2):
-        raise Mismatch(f"{robot.kind}: over ROS 2 a robot drives in the plane by speed and turn rate")
+        raise Mismatch(
+            f"{robot.kind}: `brakeline ros2` is for robots that drive in the plane by speed and turn rate. For others, "
+            "use `SafetyClient`"
+        )
     return robot
 
 

@@ -14,10 +14,10 @@ log = logging.getLogger("brakeline.collect")
 
 
 class PartialSave:
-    """Saves a growing data set to `path`. It does so in a thread, because the caller has a control period to keep."""
+    """Saves a growing data set to a file, in a thread, so that a control period of the caller never waits for it."""
 
     def __init__(self, path: Path) -> None:
-        """Prepare to save. An earlier partial data set at `path` moves aside, and replaces no other one."""
+        """Prepare to save to `path`. Rename an earlier partial data set there to a name that no file has yet."""
         self._path, self._pool = path, ThreadPoolExecutor(1, "partial-save")
         self._last: Future[None] | None = None
         if path.exists():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Evaluation
 
 MOST_ROBOTS = 128
-TURNS = 8  # episodes of each robot: with fewer, most driving would be for nothing while the last episodes end
+TURNS = 8  # episodes of each robot: with fewer, more robots drive for nothing while the last ones end
 ONE_BY_ONE = "evaluate without --backend batch"
 
 

@@ -101,15 +101,15 @@ class Listener(Subscription):
         handler: Callable[[Sample], None],
         rejected: RejectedMessages,
     ) -> None:
-        self.topic, self._cut, self._handler = topic, len(prefix) + 1, handler
+        self.topic, self._prefix_length, self._handler = topic, len(prefix) + 1, handler
         self._delivering = threading.Lock()  # one thread delivers single samples, another one those of bundles
         self._keys_of: Counter[str] = Counter()  # by identity
         self._known: set[str] = set()  # keys
         super().__init__(key, receiver, self._take, rejected)
 
     def _take(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)[self._cut :]
-        self._check_size(key, len(sample.payload))
+        key = str(sample.key_expr)[self._prefix_length :]
+        self._check_size(key, len(sample.payload))  # before the copy of the payload
         self.deliver(key, sample.payload.to_bytes(), steady_time_ns())
 
     def deliver(self, key: str, payload: bytes, received: int) -> None:

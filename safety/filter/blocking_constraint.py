@@ -99,7 +99,9 @@ class Planes:
         return normal, float(self.offsets[which, period]) + distance
 
 
-def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes: list[Planes]) -> BlockingConstraint:
+def blocking(
+    row: int, room: float, robot: Robot, around: ConstraintSources, planes: list[Planes]
+) -> BlockingConstraint:
     """Return the constraint of a row, which is `room` away. planes: the half-spaces of each disc under the proposal."""
     N, T = robot.horizon, robot.period
     number = row

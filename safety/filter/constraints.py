@@ -12,7 +12,7 @@ from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, ConstraintSources, Planes, worst
+from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, ConstraintSources, Planes, blocking
 from brakeline.safety.filter.clearance_margin import ClearanceMargin
 from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
 from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels, tube_kernels
@@ -378,7 +378,7 @@ class TubeConstraints:
             return BlockingConstraint.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
         row = int(np.argmin(short))
         around = ConstraintSources(local_map.near, local_map.moving, local_map.unseen, local_map.other_reservations)
-        return worst(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
+        return blocking(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
 
     def clear(self, request: Request, local_map: LocalMap, z: Array, margin: float) -> tuple[float, bool]:
         """Return the margin [m] for a report, and whether it is only a lower bound.

@@ -54,9 +54,9 @@ class StateLimits:
         if robot.heading is not None:
             self.heading_weights = weights[:, robot.heading]
         self.arc_middle = np.array([_middle_of_arc(robot, i) for i in range(self.count)])
-        further = [i for i in extra_coordinates(robot) if i < n]
-        self.other_weights = weights[:, further]
-        self.other_coordinates = [extra_coordinates(robot).index(i) for i in further]
+        others = [i for i in extra_coordinates(robot) if i < n]
+        self.other_weights = weights[:, others]
+        self.other_coordinates = [extra_coordinates(robot).index(i) for i in others]
         self.nz, self.chord_columns = tube.position.shape[2], np.eye(N + 1)
         self.row_periods = np.append(np.arange(N), N - 1)
         self.chord_scales = np.linalg.norm(self.position_weights, axis=1) if d else robot.limit_scales

@@ -10,10 +10,10 @@ inputs by a first-order lag of time constant τ; the model is a unicycle, or a v
     p' = v (cos θ, sin θ),   θ' = ω,   τ v' = u_v − v,   τ ω' = u_ω − ω        (unicycle)
     p' = v,   τ v' = u − v                                                     (velocities)
 
-Sequential quadratic programming solves it: linearise the predicted positions in the inputs, and each distance at its
-closest point; begin at the proposal, else at the last plan, else at standing. Without a solution, the robot follows its
-last plan, as in the article. The model is nominal, so the margin alone allows for its error; the article's stochastic
-and robust versions tighten constraints instead.
+Sequential quadratic programming solves it. Each program linearises the predicted positions in the inputs, and each
+distance at its closest point. The first attempt starts at the proposal, the second one at the last plan, the third one
+at standing. Without a solution, the robot follows its last plan, as in the article. The model is nominal, so the margin
+alone allows for its error. The stochastic and robust versions in the article tighten constraints instead.
 """
 
 from __future__ import annotations

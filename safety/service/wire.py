@@ -72,7 +72,7 @@ def batch_of(payload: bytes) -> pb.RequestBatch:
 def _count_requests(payload: bytes, most: int) -> int:
     """Return the number of requests of a batch on the wire, or `most + 1` if there are more, or too many other fields.
 
-    Decoding half a million empty requests would take longer than a robot can wait.
+    The service counts before it decodes: to decode half a million empty requests takes longer than a robot can wait.
     """
     at = count = others = 0
     while at < len(payload) and count <= most:
@@ -81,12 +81,12 @@ def _count_requests(payload: bytes, most: int) -> int:
             count += 1
         else:
             others += 1
-        kind = tag & 7
-        if kind in (FIXED_64, FIXED_32):
-            at += 8 if kind == FIXED_64 else 4
+        wire_type = tag & 7
+        if wire_type in (FIXED_64, FIXED_32):
+            at += 8 if wire_type == FIXED_64 else 4
         else:
             value, at = _varint(payload, at)
-            at += value if kind == LENGTH else 0
+            at += value if wire_type == LENGTH else 0
         if others > MAX_OTHER_FIELDS:
             return most + 1
     return count

@@ -15,7 +15,7 @@ from brakeline.safety.filter.batch.dual_active_set import BatchSolution, solve_b
 from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.qp import ROW_TIGHTENING, QPBuilder
 
-ROUNDING = 1e-9  # m: the order in which numbers are added may decide a comparison of values that are nearer
+ROUNDING = 1e-9  # m: for values nearer to each other, the order of the sums may decide their comparison
 
 
 class RowBatch(NamedTuple):
@@ -68,16 +68,15 @@ class QPBatch:
             bound = bound - sum(normals[i] * ends.places(fixed[:, first + i])[:, None] for i in axes)
             own = [ends.places(slopes[:, first + i])[:, :, None] for i in axes]  # (E, F, 1, B)
             gradient = [sum(normals[i] * own[i][:, j] for i in axes) for j in range(self.free)]
-            columns = [*zip(ends.alongs(normals, plan.path.stretch), ends.columns, strict=True)]
-            wide = [along * scene.widening for along, _ in columns] + [scene.widening]
-            index = [of for _, of in columns] + [ends.extra]
-            bound = bound - sum(w * xp.take(constant, of, axis=0)[:, None] for w, of in zip(wide, index, strict=True))
+            alongs = ends.alongs(normals, plan.path.stretch)
+            # A row subtracts the magnitudes of its generators and its chord deviation, times these factors.
+            factors = [*(along * scene.widening for along in alongs), scene.widening]
+            magnitudes = [*zip(factors, (*ends.columns, ends.extra), strict=True)]
+            bound = bound - sum(w * xp.take(constant, which, axis=0)[:, None] for w, which in magnitudes)
             shape = bound.shape
             spread = []
             for t in range(self._atoms):
-                parts = (
-                    w * xp.take(self._M_t[:, t], of, axis=0)[:, None, None] for w, of in zip(wide, index, strict=True)
-                )
+                parts = (w * xp.take(self._M_t[:, t], which, axis=0)[:, None, None] for w, which in magnitudes)
                 spread.append(xp.broadcast_to(sum(parts), shape))
             flat = (-1, shape[-1])
             gradients.append(xp.stack([xp.reshape(part, flat) for part in gradient]))

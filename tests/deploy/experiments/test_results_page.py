@@ -67,7 +67,8 @@ def store(folder) -> None:
     folder.mkdir(exist_ok=True, parents=True)
     for method, runs in GOALS.items():
         for cell, goals in zip(cell_configs("ground", (method,), range(len(runs))), runs, strict=True):
-            own = replace(cell, physics=2, td3=learning(TD3Config(), method, robot_with_task("ground").task.learner))
+            settings = robot_with_task("ground").task.learner
+            own = replace(cell, physics=2, td3=learning(TD3Config(), method, "ground", settings))
             hit = 0 if method == "ddpc" else 2
             training = evaluation(90, 3 * hit) | {"steps": 60_000}
             trials = {f"trained-{method}-default": evaluation(goals, hit)}
