@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from brakeline.deploy.commands.command_output import console, errors
 from brakeline.deploy.commands.common_options import Json, Quiet, RunBusOptions, RunFolder, Seed, Verbose
-from brakeline.deploy.commands.train_command import dated_folder, train
+from brakeline.deploy.commands.train_command import run_folder, train
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import EXPERIMENTS
 from brakeline.safety.model.model_config import AUTO, ModelConfig
@@ -38,8 +38,8 @@ class DemoCommand:
         shown = errors if self.json else console
         shown.print(f"{share:.0%} of its inputs were corrected. Now a policy learns behind the filter, from nothing:")
         config = replace(EXPERIMENTS["demo"], steps=self.steps, seed=self.seed)
-        folder, bus = self.out or dated_folder(), RunBusOptions()
-        return train(config, folder, False, bus, self.json, self.verbose, watch=True, browser=False)
+        with run_folder(self.out) as folder:
+            return train(config, folder, False, RunBusOptions(), self.json, self.verbose, watch=True, browser=False)
 
     def _driven(self, method: str, what: str) -> dict[str, Any]:
         """Drive the stored policy, print how the episodes ended, and return the figures."""

@@ -10,7 +10,7 @@ import tyro
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
-from brakeline.deploy.commands.train_command import STOPPED, dated_folder
+from brakeline.deploy.commands.train_command import STOPPED, run_folder
 from brakeline.deploy.run.run_config import AutopilotConfig, RunConfig
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.messaging.robot import robot_named
@@ -77,10 +77,11 @@ class FlyCommand:
         from brakeline.deploy.run.display import Display, summary
         from brakeline.deploy.run.launcher import Launcher, prepare
 
-        config, folder = self.config(), self.out or dated_folder()
-        config = prepare(config, folder, resume=False)
-        with Display(errors if self.json else console, config.steps * len(config.flights)) as display:
-            figures = Launcher(config, folder, self.bus.settings(config, folder)).run(display)
+        config = self.config()
+        with run_folder(self.out) as folder:
+            config = prepare(config, folder, resume=False)
+            with Display(errors if self.json else console, config.steps * len(config.flights)) as display:
+                figures = Launcher(config, folder, self.bus.settings(config, folder)).run(display)
         actors = [f"actor-{i}" for i in range(len(config.flights))]
         figures["flight"] = flight_figures(figures, actors[0])
         if len(actors) > 1:

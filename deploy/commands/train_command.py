@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -152,14 +153,15 @@ class TrainCommand(RunConfig):
 
     def run(self) -> int:
         """Run the training. Returns the exit status."""
-        folder, config = self.resume or self.out or dated_folder(), self.config()
+        config = self.config()
         if config.from_logs:
             from brakeline.deploy.run.log_feed import check_logs
             from brakeline.messaging.task import robot_with_task
 
             for name in config.robots:  # a mistyped path ends the command before it starts a process
                 check_logs(config.from_logs, robot_with_task(name))
-        return train(config, folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
+        with run_folder(self.resume or self.out) as folder:
+            return train(config, folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
 
 
 def train(
@@ -203,6 +205,29 @@ def train(
     return STOPPED if not figures["finished"] else int(bool(not_saved(figures)))
 
 
-def dated_folder() -> Path:
-    """Return the default folder of a run that starts now."""
-    return Path("runs") / time.strftime("%Y%m%d-%H%M%S")
+@contextmanager
+def run_folder(given: Path | None) -> Iterator[Path]:
+    """Yield the folder of a run: the given one, or a new one with the time as its name.
+
+    Runs that start within the same second have different folders. A new folder that stays empty is removed.
+    """
+    folder = given or _new_folder(Path("runs") / time.strftime("%Y%m%d-%H%M%S"))
+    try:
+        yield folder
+    finally:
+        if given is None:
+            with suppress(OSError):  # it holds a run
+                folder.rmdir()
+
+
+def _new_folder(folder: Path) -> Path:
+    """Make a folder of this name, or with a number after it if another run has the name, and return it."""
+    name, number = folder.name, 1
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            number += 1
+            folder = folder.with_name(f"{name}_{number}")

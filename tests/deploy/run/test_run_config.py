@@ -13,7 +13,7 @@ from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.deploy.cli import parse
 from brakeline.deploy.commands.common_options import ServiceOptions
 from brakeline.deploy.commands.fly_command import FlyCommand
-from brakeline.deploy.commands.train_command import TrainCommand
+from brakeline.deploy.commands.train_command import TrainCommand, run_folder
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
 from brakeline.deploy.experiments.tuning_trials import SEED_KEY
 from brakeline.deploy.policy_loading import policy_named
@@ -214,3 +214,18 @@ def test_the_processes_of_a_robot_with_a_dot_in_its_name_have_certificates(tmp_p
     keys = make_run_keys(config, tmp_path)
     for spec in process_specs(config):
         assert tls(keys, spec.name, listens=False)
+
+
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch) -> None:
+    """Before, both made keys and copied models in one folder, and one of them ended with an error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda _: "20260930-120000")
+    with run_folder(None) as first, run_folder(None) as second, run_folder(None) as empty, run_folder(first) as given:
+        assert [first.name, second.name] == ["20260930-120000", "20260930-120000_2"] and given == first
+        for folder in (first, second):
+            (folder / "config.json").touch()
+    assert empty.name == "20260930-120000_3" and sorted(Path("runs").iterdir()) == [first, second]
+    Path("runs").rename("elsewhere")
+    Path("runs").symlink_to("nowhere")
+    with pytest.raises(FileExistsError), run_folder(None):
+        pass
