@@ -1,0 +1,208 @@
+"""Laws of the figures on README and pages: they are those of the stored cells of the comparisons."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.deploy.experiments.comparison_table import evaluation_name, steps_to_learn
+
+pytestmark = pytest.mark.fast
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
+
+
+@cache
+def cells(folder: str, method: str) -> list[dict[str, Any]]:
+    """Return the stored cells of a method in a folder of `results/`, by seed."""
+    paths = [path for path in (RESULTS / folder).glob(f"{method}-s*.json") if re.search(r"-s\d+$", path.stem)]
+    return sorted((json.loads(path.read_text()) for path in paths), key=lambda cell: cell["study"]["seed"])
+
+
+def seeds(stored: list[dict[str, Any]]) -> list[int]:
+    return [cell["study"]["seed"] for cell in stored]
+
+
+def counts(stored: list[dict[str, Any]], arena: str, column: str) -> list[int]:
+    """Return the sum of a column over the episodes of an evaluation, for each seed."""
+    trial = evaluation_name(stored[0]["study"]["method"], arena)
+    return [sum(cell["evaluations"][trial]["episodes"][column]) for cell in stored]
+
+
+def shares(stored: list[dict[str, Any]], arena: str, column: str) -> list[float]:
+    """Return the share of an evaluation's episodes, of interventions that of its steps, for each seed."""
+    of = [cell["study"]["episodes"] for cell in stored]
+    of = counts(stored, arena, "steps") if column == "interventions" else of
+    return [count / all_of for count, all_of in zip(counts(stored, arena, column), of, strict=True)]
+
+
+def learned(stored: list[dict[str, Any]]) -> list[float]:
+    return [steps_to_learn(cell["training"]["episodes"], cell["training"]["steps"]) for cell in stored]
+
+
+def percents(stored: list[dict[str, Any]], column: str, joint: str = ", ") -> str:
+    """Return the mean shares in both arenas, such as `99.8 %, 99.6 %`."""
+    return joint.join(f"{100 * np.mean(shares(stored, arena, column)):.1f} %" for arena in ("default", "dense"))
+
+
+def table_rows(page: str, first: str) -> list[list[str]]:
+    """Return the cells of the rows of each table of a page whose first line begins with `first`."""
+    lines = [line.strip() for line in (ROOT / page).read_text().splitlines()]
+    rows = []
+    for head, line in enumerate(lines):
+        if line.startswith(first):
+            end = next((k for k in range(head, len(lines)) if not lines[k].startswith("|")), len(lines))
+            rows += [[cell.strip() for cell in row[1:-1].split("|")] for row in lines[head + 2 : end]]
+    assert rows, first
+    return rows
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.rglob("table.json")), ids=lambda path: str(path.relative_to(RESULTS)))
+def test_a_stored_table_is_of_the_stored_cells(path: Path) -> None:
+    """The intervals are those of `brakeline compare --table`; they are not drawn again here."""
+    table, folder = json.loads(path.read_text()), str(path.parent.relative_to(RESULTS))
+    methods = {found[1] for cell in path.parent.glob("*.json") if (found := re.fullmatch(r"(.+)-s\d+", cell.stem))}
+    assert methods == set(table["seeds"])
+    for method, numbers in table["seeds"].items():
+        stored, training = cells(folder, method), table["parts"]["training"][method]
+        assert seeds(stored) == numbers and training["steps to 90 % goals"]["seeds"] == learned(stored)
+        collisions = [sum(cell["training"]["episodes"]["collision"]) for cell in stored]
+        assert training["collisions"] == pytest.approx(np.mean(collisions))
+        for arena in ("default", "dense"):
+            row = table["parts"][arena][method]
+            for name, column in (("goal rate", "goal"), ("collision rate", "collision"), ("interventions",) * 2):
+                assert row[name]["seeds"] == pytest.approx(shares(stored, arena, column)), (method, arena, name)
+                assert row[name]["low"] <= row[name]["value"] <= row[name]["high"]
+
+
+@pytest.mark.parametrize(
+    ("decision", "folder"), [("closest input", "closest_input/ground"), ("turning aside", "ground")]
+)
+def test_the_rows_of_the_deadlock_have_the_stored_figures(decision: str, folder: str) -> None:
+    stored = cells(folder, "ddpc")
+    figures = []
+    for arena in ("default", "dense"):
+        corrected = ", ".join(f"{100 * share:.1f}" for share in shares(stored, arena, "interventions"))
+        figures += [", ".join(map(str, counts(stored, arena, "goal"))), f"{corrected} %"]
+    rows = table_rows("docs/results_ground.md", "| robots at once |")
+    assert ["16", decision, decision, *figures, f"{np.mean(learned(stored)):,.0f}"] in rows
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/results.md", "docs/results_ground.md"])
+def test_the_pages_say_what_ours_reaches_without_turning_aside(name: str) -> None:
+    stored, text = cells("closest_input/ground", "ddpc"), " ".join((ROOT / name).read_text().split())
+    default, dense = percents(stored, "goal").split(", ")
+    assert f"{default} and {dense}" in text or f"{default} and, in `dense`, {dense}" in text
+    assert f"{np.mean(learned(stored)):,.0f}" in text
+
+
+def sac_cells(robot: str, method: str, rate: float) -> list[dict[str, Any]]:
+    """Return the stored cells of SAC with a learning rate, wherever they are stored."""
+    folders = [path.parent for path in RESULTS.rglob(f"{robot}/table.json")]
+    stored = [cell for folder in folders for cell in cells(str(folder.relative_to(RESULTS)), method)]
+    stored = [cell for cell in stored if cell["study"]["td3"]["actor_rate"] == rate]
+    assert len(set(seeds(stored))) == len(stored)
+    return sorted(stored, key=lambda cell: cell["study"]["seed"])
+
+
+NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+def test_the_table_of_sacs_learning_rates_has_the_stored_figures() -> None:
+    """A row: the rate, and SAC; SAC with our filter. Figures that no stored cell has must name a commit."""
+    for rate, steps, goals, collisions, places in table_rows("docs/results.md", "| learning rate |"):
+        robot = "quadrotor" if re.search("air|quadrotor", rate) else "ground"
+        columns = [cell.split("; ") for cell in (steps, goals, collisions, places)]
+        for method, *figures, place in zip(("sac", "sac-ddpc"), *columns, strict=True):
+            stored = sac_cells(robot, method, float(re.findall(r"0\.\d+", rate)[0]))
+            if not stored:
+                assert "commit" in place, (rate, method)
+                continue
+            collided = [sum(cell["training"]["episodes"]["collision"]) for cell in stored]
+            expected = f"{np.mean(learned(stored)):,.0f}", percents(stored, "goal", " and ")
+            assert figures == [*expected, f"{np.mean(collided):.0f}"], (rate, method)
+            spelled = f"{NUMBERS[len(stored)]} seed", f"seeds {', '.join(map(str, seeds(stored)))}"
+            assert any(words in place for words in spelled), (rate, method, place)
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/results_ground.md"])
+def test_the_pages_say_how_many_steps_sac_needs_at_the_same_learning_rate(name: str) -> None:
+    text = (ROOT / name).read_text()
+    for method, rate in (("sac", 0.0003), ("sac-ddpc", 0.0003), ("sac-ddpc", 0.003)):
+        assert f"{np.mean(learned(sac_cells('ground', method, rate))):,.0f}" in text, (method, rate)
+
+
+OTHERS = {  # rows of the table of other settings, with the folder and the method of their cells
+    "TD3, 300,000 steps": ("plateau/quadrotor", "none"),
+    "SAILR, η = 0.15, 300,000 steps": ("plateau/quadrotor", "sailr"),
+    "SAILR, η = 0.15": ("former_settings/quadrotor", "sailr"),
+    "CBF-QP, α = 2": ("former_settings/quadrotor", "cbf"),
+    "SECAS, margin 0.4 m": ("former_settings/quadrotor", "secas"),
+    "TD3-Lagrange, multiplier rate 1": ("lagrange/quadrotor", "lagrange"),
+}
+
+
+def test_the_table_of_other_settings_has_the_stored_figures() -> None:
+    """One seed: numbers of collisions; several: shares. A row of SAC without a stored cell says so."""
+    tied = set()
+    for label, *row in table_rows("docs/results_quadrotor.md", "| training | seeds | goals | collisions |"):
+        rate = re.fullmatch(r"SAC behind our filter, (?:learning )?rate (0\.\d+)", label)
+        if not rate and label not in OTHERS:
+            continue
+        stored = sac_cells("quadrotor", "sac-ddpc", float(rate[1])) if rate else cells(*OTHERS[label])
+        tied.add(label)
+        if not stored:
+            assert "commit" in label or "not stored" in label, label
+            continue
+        collided = [sum(counts(stored, arena, "collision")) for arena in ("default", "dense")]
+        many, reached = ", ".join(map(str, collided)), learned(stored)
+        percent = percents(stored, "collision") if len(stored) > 1 and any(collided) else many
+        steps = f"{np.mean(reached):,.0f}" if min(reached) < stored[0]["study"]["steps"] else "not reached"
+        filtered = METHODS[stored[0]["study"]["method"]].filter != "none"
+        expected = [str(len(stored)), percents(stored, "goal"), percent]
+        assert [*row[:3], *row[4:]] == [*expected, steps, percents(stored, "interventions") if filtered else "–"], label
+        training = [cell["training"]["episodes"]["collision"] for cell in stored]
+        total, episodes = sum(map(sum, training)), sum(map(len, training))
+        said = row[3].removesuffix(" episodes").split(" in ")
+        each = said[1:] == ["each"]
+        assert said[0] == f"{total / len(stored) if each else total:.0f}" and (
+            each or said[1:] in ([], [f"{episodes:,}"])
+        )
+    assert tied >= set(OTHERS)
+
+
+FEWER = {  # rows of the table of fewer corrections, likewise
+    "ours, neither": ("fewer_corrections/neither/quadrotor", "ddpc"),
+    "ours, imitation 1": ("fewer_corrections/imitation/quadrotor", "ddpc"),
+    "ours, growth 4": ("fewer_corrections/growth/quadrotor", "ddpc"),
+    "ours, both": ("fewer_corrections/both/quadrotor", "ddpc"),
+    "ours, both, with today's clearance margin (the table above)": ("quadrotor", "ddpc"),
+    "CBF-QP, α = 2, neither": ("fewer_corrections/neither/quadrotor", "cbf"),
+    "CBF-QP, α = 2, both": ("former_settings/quadrotor", "cbf"),
+    "SECAS, 0.4 m, neither": ("fewer_corrections/neither/quadrotor", "secas"),
+    "SECAS, 0.4 m, both": ("former_settings/quadrotor", "secas"),
+}
+
+
+def test_the_table_of_fewer_corrections_has_the_stored_figures() -> None:
+    rows = {
+        label.strip("*"): row for label, *row in table_rows("docs/results_quadrotor.md", "| training | seeds | steps")
+    }
+    assert set(rows) == set(FEWER)
+    for label, (folder, method) in FEWER.items():
+        stored = cells(folder, method)
+        episodes = [cell["study"]["episodes"] for cell in stored]
+        steps = np.mean(np.array(counts(stored, "default", "steps")) / episodes)
+        without = [cell["evaluations"].get("trained-none-default") for cell in stored]
+        collided = [np.mean(one["episodes"]["collision"]) for one in without if one]
+        figures = [str(len(stored)), f"{np.mean(learned(stored)):,.0f}", percents(stored, "goal")]
+        figures += [percents(stored, "interventions"), f"{steps:.1f}"]
+        assert rows[label] == [*figures, f"{100 * np.mean(collided):.1f} %" if collided else "–"], label
