@@ -32,8 +32,9 @@ class FlyCommand:
     """Let this policy fly: trained, untrained, random, greedy, adversary, astar, careful or a weights file.
     With `learn`, learn a policy from the flight."""
     url: tuple[str, ...] = ()
-    """Fly the vehicles behind these links: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Each vehicle flies alone
-    on its own map, and all share one safety service. Without a link the command simulates the vehicles."""
+    """Fly the vehicles behind these links: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Each vehicle flies
+    as if it were alone on the same map: nothing keeps vehicles apart. All share one safety service. Without a link the
+    command simulates the vehicles."""
     systems: tuple[int, ...] = ()
     """Address the vehicles by these MAVLink system ids, one for each link. Defaults to --system for all."""
     vehicles: int = 1
