@@ -45,7 +45,7 @@ from brakeline.safety.filter.request import (
     check_surroundings,
 )
 from brakeline.safety.filter.reservation import Reservation
-from brakeline.safety.filter.standing import stands
+from brakeline.safety.filter.standing import DRIVES_ALREADY, may_drive_already, stands
 from brakeline.safety.filter.turning_aside import find_plan
 from brakeline.safety.filter.window_score import WindowScore
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
 
 WORTH_A_BATCH = 20  # requests for each period of a plan; fewer are decided sooner one by one
 NOT_RECORDED = "the proposed action is outside the inputs that were recorded"
+UNRECORDED = "the state is outside the domain that was recorded"
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -198,20 +199,21 @@ class Filter:
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
         proposal = self.inputs.limited(request.action, z_0[-self.robot.action_dim :])
         local_map = self.constraints.local_map(request, z_0, self.builder.reachable(z_0[-self.robot.action_dim :]))
-        in_domain = tube_kernels.within(z_0, self.domain)
+        unsure = "" if tube_kernels.within(z_0, self.domain) else UNRECORDED
+        if not unsure and may_drive_already(request, self.robot):
+            _, constraints, stay = self._rest_of_plan(request, local_map, z_0)
+            unsure = "" if stands(request, local_map, constraints, stay) else DRIVES_ALREADY
         candidate = None
-        if blind:
-            record.reason = blind
-        elif in_domain:
+        if blind or unsure:
+            record.reason = blind or unsure
+        else:
             committed = request.plan[self.robot.committed_steps : self.robot.free_steps].ravel()
             search = PlanSearch(self, local_map, z_0, proposal, record)
             candidate = find_plan(search, committed, request.turn_aside)
             self._note_unrecorded(request.action, search, candidate)
-        else:
-            record.reason = "the state is outside the domain that was recorded"
         if candidate is None:
-            candidate = self._committed(request, local_map, z_0, record, in_domain)
-            if in_domain and not blind:
+            candidate = self._committed(request, local_map, z_0, record, not unsure)
+            if not (blind or unsure):
                 candidate = RecoverySearch(self, request, local_map, z_0).candidate() or candidate
             if isinstance(request.scan, RangeImage) and (lacking := unseen_poles(request.scan)):
                 record.reason += f"; {lacking}"
@@ -299,12 +301,7 @@ class Filter:
         if not record.contained:
             record.reason += "; the measured state was outside the predicted set"
         before = z_0[-self.robot.action_dim :]
-        tail = request.plan
-        if self.robot.feedback:  # a feedback decides this period's input from the measured state
-            tail = np.vstack([self.robot.stop_by_feedback(tail[:1], request.state, before), tail[1:]])
-        chosen = tail[self.robot.committed_steps : self.robot.free_steps].ravel()
-        as_committed = np.concatenate([z_0, chosen])
-        constraints = self.constraints_for(as_committed, local_map.widening)
+        tail, constraints, as_committed = self._rest_of_plan(request, local_map, z_0)
         was_verified = request.model == self.version and not record.broken
         was_verified |= stands(request, local_map, constraints, as_committed)
         if request.touches_another:
@@ -314,7 +311,7 @@ class Filter:
             margin = constraints.margin_in(local_map, as_committed)
             return PlanCandidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
         brake = self.inputs.regressors(z_0, self.executable.stop(request.state, before))
-        as_committed[len(z_0) :] = self.executable.within(chosen, before)
+        as_committed[len(z_0) :] = self.executable.within(as_committed[len(z_0) :], before)
         candidates = list[PlanCandidate]()
         for z in (brake, as_committed):
             constraints = self.constraints_for(z, local_map.widening)
@@ -324,6 +321,15 @@ class Filter:
         if candidates[-1].verified:
             return candidates[-1]
         return max(candidates, key=lambda candidate: np.nan_to_num(candidate.margin, nan=-np.inf))
+
+    def _rest_of_plan(self, request: Request, local_map: LocalMap, z_0: Array) -> tuple[Array, TubeConstraints, Array]:
+        """Return the inputs (N, m) of the committed backup plan from now on, its constraints and its regressors."""
+        tail = request.plan
+        if self.robot.feedback:  # a feedback decides this period's input from the measured state
+            before = z_0[-self.robot.action_dim :]
+            tail = np.vstack([self.robot.stop_by_feedback(tail[:1], request.state, before), tail[1:]])
+        z = np.concatenate([z_0, tail[self.robot.committed_steps : self.robot.free_steps].ravel()])
+        return tail, self.constraints_for(z, local_map.widening), z
 
     def _decision(
         self, request: Request, local_map: LocalMap, candidate: PlanCandidate, record: DecisionRecord

@@ -1,14 +1,19 @@
-"""Decide from a request and the model set whether a robot stands."""
+"""Decide from a request and the model set whether a robot stands, or drives already."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from brakeline.messaging.robot import Array
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.request import Request
 from brakeline.safety.model.model_set import extra_coordinates
+
+DRIVES_ALREADY = (
+    "the robot drives already, and its first request names the input of a robot that stands: nothing is known of the "
+    "true one"
+)
 
 
 def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array) -> bool:
@@ -30,3 +35,15 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
     limited, tube = list(extra_coordinates(robot)), constraints.tube
     half = constraints.widening * tube.more_half_widths(z) + np.asarray(robot.measurement_bound)[limited]
     return bool((np.abs(tube.more_offset - request.state[limited]) <= half).all())
+
+
+def may_drive_already(request: Request, robot: Robot) -> bool:
+    """Return whether this may be the first request of a program, about a robot that drives already.
+
+    Such a request names the input in force of a standing robot, and nobody knows the true one. A robot whose measured
+    speeds are no more than their errors counts as standing. Whether another one drives, `stands` says.
+    """
+    if request.predicted is not None or not request.still(robot):
+        return False
+    speeds = list(robot.regressor)
+    return bool((np.abs(request.state[speeds]) > np.asarray(robot.measurement_bound)[speeds]).any())

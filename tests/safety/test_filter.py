@@ -18,6 +18,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, Request
+from brakeline.safety.filter.standing import DRIVES_ALREADY
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import decision_reply
@@ -41,6 +42,25 @@ def test_a_robot_that_flies_when_its_program_begins_has_no_verified_plan_to_stan
         near = Shapes.of([Obstacle("sphere", (QUADROTOR.footprint + 0.55, 0.0, 0.0), (0.5,))], 3)
         decision = ready.decide(replace(first, state=state, action=np.full(3, np.nan), obstacles=near))
         assert (decision.kind, decision.verified) == (FAILSAFE, True)
+
+
+def test_nothing_is_verified_before_the_input_in_force_of_a_robot_that_flies_is_known():
+    """Its first request names the input of a robot that stands, and the tube of a proposal would begin with that."""
+    ready = Filter.load("quadrotor")
+    rest, nothing = np.zeros((QUADROTOR.horizon, 3)), Shapes.of([], 3)
+    flies, hovers, tilts = np.zeros((3, 9))
+    flies[3], hovers[:], tilts[3:6] = 3.0, QUADROTOR.measurement_bound, 0.1
+    first = [
+        Request(state, np.full(3, 0.5), rest[0], rest, nothing, known_free=True) for state in (flies, hovers, tilts)
+    ]
+    kinds = [(FAILSAFE, False), (ALLOWED, True), (ALLOWED, True)]
+    assert [(one.kind, one.verified) for one in map(ready.decide, first)] == kinds
+    batch = ready.decide_batch(RequestArrays.of(first))
+    assert [(batch.row(i).kind, batch.row(i).verified) for i in range(3)] == kinds
+    assert batch.row(0).reason == DRIVES_ALREADY
+    client = InProcess(ready)
+    for kind in (FAILSAFE, ALLOWED):  # it brakes for one period, and then its input is known
+        assert client.decide(flies, first[0].action, known_free=True).kind == kind
 
 
 @pytest.mark.parametrize("way", [0.28, 0.35, 0.45, 0.7])

@@ -30,7 +30,7 @@ from brakeline.safety.filter.batch.score_batch import ScoreBatch
 from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
 from brakeline.safety.filter.batch.set_batch import SetBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
-from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
+from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, STOPPED, FastRequestCheck
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -57,6 +57,8 @@ class LaneDecisions:
         self._aside = AsideBatch(safety, self._search, constant, xp)
         self._furthest = max(robot.sight, base.reach)
         self._regressor = constant(np.array(robot.regressor))
+        self._error = constant(np.array(robot.measurement_bound)[list(robot.regressor)])
+        self._at_rest = constant(robot.zero_at_rest.astype(float))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
         self._domain = constant(safety.domain[:, :, None])
         ends = robot.low(), robot.high(), safety.inputs.low, safety.inputs.high
@@ -125,7 +127,16 @@ class LaneDecisions:
         if (past := requests.past) is not None:
             window = xp.concat([xp.reshape(past.states, (B, -1)), xp.reshape(past.inputs, (B, -1))], axis=1)
             good &= xp.all(xp.abs(window) < HUGE, axis=1) | ~past.given
-        return good
+        return good & ~self._may_drive_already(requests)
+
+    def _may_drive_already(self, requests: RequestArrays) -> Array:
+        """Return which rows (B,) are those of `standing.may_drive_already`."""
+        xp, model = self._xp, requests.model
+        names = [model] * len(requests) if isinstance(model, str) else model
+        first = xp.asarray(np.array([not name for name in names], dtype=bool), device=self._device)
+        first &= xp.any(xp.abs(xp.take(requests.state, self._regressor, axis=1)) > self._error, axis=1)
+        first &= xp.all(xp.abs(requests.input_in_force) * self._at_rest < STOPPED, axis=1)
+        return first if requests.predicted is None else first & ~requests.predicted.given
 
     def _lanes_of(self, requests: RequestArrays, rows: Array) -> LaneBatch:
         """Return the lanes of some rows, with the obstacles within reach."""
