@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,7 +19,7 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.processes import CONFIG, UNFINISHED, ProcessSpec, write_endpoint
-from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
+from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, encode, load
 from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.errors import DamagedPart, LaunchError
@@ -133,6 +134,13 @@ def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path)
     with pytest.raises(DamagedPart, match="latest"):
         prepare(config, tmp_path, resume=True)
     prepare(replace(config, from_logs=(str(tmp_path),)), tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("kind", [{"backend": BATCH}, {"deterministic": True, "actors": 1}])
+def test_a_run_that_cannot_learn_from_its_log_is_not_told_to(tmp_path: Path, kind: dict[str, Any]) -> None:
+    with pytest.raises(LaunchError, match=r"there is no checkpoint in .*Begin anew in another folder") as refused:
+        prepare(RunConfig(method="none", **kind), tmp_path, resume=True)
+    assert "--from-logs" not in str(refused.value)
 
 
 @pytest.mark.parametrize("logs", [(), ("runs/a",)])
