@@ -265,7 +265,13 @@ class RunBusOptions:
     """Serve /metrics of the launcher at PORT of this machine, or at HOST:PORT. Its processes use the next ports."""
 
     def settings(self, config: RunConfig, folder: Path) -> BusSettings:
-        """Return the bus settings of the launcher. Makes the run's own keys if the run needs any."""
+        """Return the bus settings of the launcher. Makes the run's own keys if the run needs any.
+
+        Raises:
+            ValueError: the port is 0, so that the run's processes could not know it.
+        """
+        if self.listen and self.listen.partition("#")[0].endswith(":0"):
+            raise ValueError(f"--listen {self.listen}: give a port, or leave it out for a free port of this machine")
         from brakeline.deploy.run.run_keys import make_run_keys
         from brakeline.messaging.bus import BusSettings
         from brakeline.messaging.bus.bus_settings import local

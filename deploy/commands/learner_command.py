@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar, Self
 
 from brakeline.deploy.commands.common_options import BusOptions, Robot, Unprefixed, task_learner
+from brakeline.deploy.commands.train_command import STOPPED
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.messaging.task import address
@@ -40,11 +41,15 @@ class LearnerCommand:
         return cls(learner=task_learner(RunConfig().learner, arguments))
 
     def run(self) -> int:
-        """Learn until the last step, SIGINT or SIGTERM. Returns the exit status."""
+        """Learn until the last step, SIGINT or SIGTERM.
+
+        Returns:
+            The exit status: 0, or `STOPPED` before the last step. So an engine that moves the process starts it again.
+        """
         from brakeline.learner.checkpoint import CHECKPOINT, exists
         from brakeline.learner.learner_process import LearnerSettings, main
 
         resume = self.resume or (self.resume_if_any and exists(self.out / CHECKPOINT))
         config = replace(self.learner, seed=self.seed, steps=self.steps)
-        main(LearnerSettings(self.endpoints.bus(), address(self.robot), self.out, resume, self.name, config))
-        return 0
+        settings = LearnerSettings(self.endpoints.bus(), address(self.robot), self.out, resume, self.name, config)
+        return 0 if main(settings) else STOPPED

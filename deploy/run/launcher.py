@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -281,11 +282,7 @@ class Launcher:
             write_key(self.folder / KEYS)  # so that each service accepts the plans that another one verified
         else:
             sign_models(self.config, self.folder, self.bus.keys)
-        folder = self.folder.resolve()  # it may be given as runs/latest, which must not point to itself
-        latest = folder.parent / "latest"
-        if latest.is_symlink() or not latest.exists():
-            latest.unlink(missing_ok=True)
-            latest.symlink_to(folder.name)
+        _link_latest(self.folder.resolve())  # it may be given as runs/latest, which must not point to itself
 
     def _start_recorder(self, process: Process, show: Callable[[], Any]) -> None:
         """Start the recorder and wait until it listens, so that the log misses no message, not even the launcher's.
@@ -371,3 +368,18 @@ class Launcher:
                 silent = time.monotonic() + SILENCE
             self._drain()
             time.sleep(0.02)
+
+
+def _link_latest(folder: Path) -> None:
+    """Make the link `latest` beside a run's folder point to it, atomically: another run may start now.
+
+    A run goes on without the link, as on a disk that has no links, or in a folder beside which you may not write.
+    """
+    latest, new = folder.parent / "latest", folder.parent / f".latest.{os.getpid()}"
+    if latest.is_symlink() or not latest.exists():
+        try:
+            new.unlink(missing_ok=True)
+            new.symlink_to(folder.name)
+            new.replace(latest)
+        except OSError as error:
+            log.warning("%s does not point to this run: %s", latest, error)

@@ -92,5 +92,7 @@ def launcher_pid(folder: Path) -> int:
 
 
 def _read_endpoint(folder: Path) -> dict[str, Any]:
-    values: dict[str, Any] = parse_json((folder / ENDPOINT).read_text())
+    values: dict[str, Any] | None = parse_json((folder / ENDPOINT).read_text())
+    if not isinstance(values, dict) or not isinstance(values["endpoint"], str):
+        raise ValueError(f"{folder / ENDPOINT} does not name the endpoint of a run")
     return values

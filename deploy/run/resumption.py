@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from brakeline.deploy.run.processes import CONFIG, process_specs
-from brakeline.deploy.run.run_config import RunConfig, load
+from brakeline.deploy.run.run_config import BATCH, RunConfig, load
 from brakeline.errors import CheckpointError, LaunchError
 from brakeline.learner import checkpoint
 
@@ -30,10 +30,7 @@ def check_resumable(config: RunConfig, folder: Path) -> None:
         learned = 0
         with suppress(*((CheckpointError,) if config.from_logs else ())):
             if not config.from_logs and not checkpoint.exists(root):
-                raise LaunchError(
-                    f"{folder}: there is no checkpoint in {root}. Learn again from the run's log: `brakeline train "
-                    f"--resume {folder} --from-logs {folder}`. Or begin anew in another folder: --out"
-                )
+                raise LaunchError(f"{folder}: there is no checkpoint in {root}. {_without_checkpoint(config, folder)}")
             learned = checkpoint.about_latest(root).get("steps", 0)
         if others and learned:
             raise LaunchError(
@@ -47,6 +44,14 @@ def check_resumable(config: RunConfig, folder: Path) -> None:
                 f"{folder}: the learner has {learned} steps already, more than --steps {config.steps}. To go on, give "
                 "more --steps; to see what came of it, `brakeline analyse`"
             )
+
+
+def _without_checkpoint(config: RunConfig, folder: Path) -> str:
+    """Say how a training without a checkpoint can go on."""
+    anew = "egin anew in another folder: --out"
+    if config.backend == BATCH or config.deterministic:
+        return f"B{anew} (a run with --backend batch or --deterministic does not learn from its log)"
+    return f"Learn again from the run's log: `brakeline train --resume {folder} --from-logs {folder}`. Or b{anew}"
 
 
 def _within(folder: Path, path: Path) -> bool:

@@ -46,7 +46,11 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     if refused := figures.get("refused"):
         lines.append(f"{refused} steps do not count: repeated, or not permitted by the learner")
     lines += _untrained(figures)
-    lines += [f"THE POLICY WAS NOT SAVED: {reason}. {_to_save(figures)}" for reason in not_saved(figures)]
+    lines += [
+        f"THE POLICY WAS NOT SAVED: {reason}. A file that is there is of earlier weights. Free some space, and learn "
+        f"again from the last checkpoint: brakeline train --resume {quote(figures['folder'])}"
+        for reason in not_saved(figures)
+    ]
     if not figures["finished"] and figures.get("policy") in (None, "learning"):
         lines.append(
             f"stopped before the last step; continue with: brakeline train --resume {quote(figures['folder'])}"
@@ -57,14 +61,6 @@ def verdict(figures: dict[str, Any]) -> list[str]:
 def not_saved(figures: dict[str, Any]) -> list[str]:
     """Return for each learner whose last policy was not written the reason, which names the file."""
     return [one["notes"][NOT_SAVED] for one in figures["processes"].values() if one["notes"].get(NOT_SAVED)]
-
-
-def _to_save(figures: dict[str, Any]) -> str:
-    folder = quote(figures["folder"])
-    return (
-        "A file that is there is of earlier weights. Free some space, and learn again from the last checkpoint: "
-        f"brakeline train --resume {folder} (if there is none, add --from-logs {folder})"
-    )
 
 
 def _untrained(figures: dict[str, Any]) -> list[str]:

@@ -39,7 +39,8 @@ class BusSettings:
         listen: endpoints at which the process is a router.
         patience: time to wait for a router at the start [s].
         lease: time after which a peer that sends nothing counts as gone [s]. On a busy machine, a process may get no
-            processor time for seconds, and a recorder must not lose what others publish meanwhile.
+            processor time for seconds, and a recorder must not lose what others publish meanwhile. Each end sends a
+            sign of life in a quarter of this time, so three quarters of it are sure to do no harm.
         query_lease: the same time for a client that asks or answers queries [s]. It is short, so that another service
             soon answers in place of one that hangs.
         stall: time for which a publisher waits for a receiver that reads nothing, before it closes the link [s].

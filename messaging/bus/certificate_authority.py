@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import re
 import socket
 from collections.abc import Iterable
 from pathlib import Path
@@ -30,6 +31,7 @@ DAYS = 365  # validity of a certificate; the authority's own certificate is vali
 MOST_DAYS = 100 * DAYS
 EARLIER = datetime.timedelta(days=1)  # certificates are valid from that time before now, since clocks differ
 HERE = ("localhost", "127.0.0.1", "::1")
+HOST = re.compile(r"(\*\.)?\w[\w.-]*", re.ASCII)  # the name of a host
 
 
 class Authority:
@@ -67,7 +69,8 @@ class Authority:
             hosts: names and addresses of a router besides those of this machine.
 
         Raises:
-            ValueError: the name does not begin with a role, or cannot be on a certificate.
+            ValueError: the name does not begin with a role, or cannot be on a certificate. Or a host is no name or
+                address.
         """
         role = role_on_certificate(name)
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -80,7 +83,8 @@ class Authority:
             .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
         )
         if role in SERVERS:
-            reached = dict.fromkeys((*HERE, socket.gethostname(), *hosts))
+            own = socket.gethostname()  # it may be a name that no certificate can hold
+            reached = dict.fromkeys((*HERE, *((own,) if HOST.fullmatch(own) else ()), *hosts))
             builder = builder.add_extension(x509.SubjectAlternativeName([_general(h) for h in reached]), critical=False)
         certificate = builder.sign(self._key, hashes.SHA256())
         write_secret(key_file(self.folder, name), _pem(key))
@@ -124,10 +128,16 @@ class Authority:
 
 
 def _general(host: str) -> x509.GeneralName:
+    """Return a host as a certificate states it. Raises ValueError: no process would ever reach such a host."""
     try:
-        return x509.IPAddress(ipaddress.ip_address(host))
+        return x509.IPAddress(ipaddress.ip_address(host.removeprefix("[").removesuffix("]")))
     except ValueError:
-        return x509.DNSName(host)
+        if HOST.fullmatch(host):
+            return x509.DNSName(host)
+    raise ValueError(
+        f"{host!r} is no name or address of a host: give it without protocol and port, such as 10.0.0.1 or "
+        "router.example.org; write the letters of other alphabets as DNS does (xn--…)"
+    )
 
 
 def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:

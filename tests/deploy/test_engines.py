@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 import tyro
 
-from brakeline.deploy.cli import command_class
+from brakeline.deploy.cli import command_class, main
 from brakeline.deploy.experiments import task_engine
+from brakeline.learner import learner_process
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -123,6 +124,13 @@ def test_compose_file_matches_the_schema():
     jsonschema.Draft201909Validator(schema).validate(compose)
     named = {volume.split(":")[0] for s in compose["services"].values() for volume in s["volumes"]}
     assert {name for name in named if not name.startswith(".")} == set(compose["volumes"])
+
+
+@pytest.mark.parametrize(("done", "status"), [(True, 0), (False, 130)])
+def test_a_learner_that_is_stopped_before_its_last_step_has_not_succeeded(monkeypatch, done, status):
+    """Before, a drained node ended the Job of a run as if its training were complete."""
+    monkeypatch.setattr(learner_process, "main", lambda _: done)
+    assert main(["learner", "ground", "--listen", "tcp/127.0.0.1:0"]) == status
 
 
 def test_systemd_verifies_the_units(tmp_path):

@@ -46,3 +46,12 @@ def test_a_run_that_has_ended_is_named_at_once(command, tmp_path, monkeypatch, w
     (run.parent / "latest").symlink_to(run.name)
     status, out, err = command(*words.split())
     assert (status, out) == (1, "") and "the run at runs/latest (first) has ended: give --connect" in err
+
+
+@pytest.mark.parametrize("text", ["", "3", "[]", "{}", '{"endpoint": 3}', '{"endpoint": "tls/127.0.0.1'])
+def test_a_damaged_file_of_the_newest_run_names_no_run(command, tmp_path, monkeypatch, text) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "latest").mkdir(parents=True)
+    (tmp_path / "runs" / "latest" / "endpoint").write_text(text)
+    status, out, err = command("status")
+    assert (status, out) == (1, "") and "no run at runs/latest: give --connect" in err

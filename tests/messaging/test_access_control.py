@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from cryptography import x509
 
 from brakeline.errors import BadKeys, BusError, NoReply, Unreachable
 from brakeline.messaging import brakeline_pb2 as pb
@@ -390,3 +391,24 @@ def test_certificates_of_an_impossible_validity_are_refused_before_there_is_a_fo
     with pytest.raises(ValueError, match=f"valid for 1 to .* days, not {days}"):
         Authority(tmp_path / "keys", days)
     assert not (tmp_path / "keys").exists()
+
+
+@pytest.mark.parametrize("host", ["10.0.0.1:7447", "tls/10.0.0.1", "", "a b", "höst"])
+def test_a_host_that_no_process_could_reach_gets_no_certificate(tmp_path: Path, host: str) -> None:
+    """Before, the certificate stated it, and clients refused the router."""
+    with pytest.raises(ValueError, match="is no name or address of a host: give it without protocol and port"):
+        Authority(tmp_path).issue("router", [host])
+    assert not (tmp_path / "router.pem").exists()
+
+
+@pytest.mark.parametrize("own", ["", "höst", "my_host"])
+def test_the_names_of_this_machine_and_addresses_of_both_kinds_are_on_a_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
+) -> None:
+    monkeypatch.setattr("socket.gethostname", lambda: own)
+    Authority(tmp_path).issue("router", ["[fe80::1]", "10.0.0.7", "router.example.org", "*.example.org"])
+    certificate = x509.load_pem_x509_certificate((tmp_path / "router.pem").read_bytes())
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    hosts = names.get_values_for_type(x509.DNSName)
+    assert hosts == ["localhost", *([own] if own == "my_host" else []), "router.example.org", "*.example.org"]
+    assert [str(one) for one in names.get_values_for_type(x509.IPAddress)][2:] == ["fe80::1", "10.0.0.7"]

@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,7 +19,7 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.processes import CONFIG, UNFINISHED, ProcessSpec, write_endpoint
-from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
+from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, encode, load
 from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.errors import DamagedPart, LaunchError
@@ -133,6 +134,13 @@ def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path)
     with pytest.raises(DamagedPart, match="latest"):
         prepare(config, tmp_path, resume=True)
     prepare(replace(config, from_logs=(str(tmp_path),)), tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("kind", [{"backend": BATCH}, {"deterministic": True, "actors": 1}])
+def test_a_run_that_cannot_learn_from_its_log_is_not_told_to(tmp_path: Path, kind: dict[str, Any]) -> None:
+    with pytest.raises(LaunchError, match=r"there is no checkpoint in .*Begin anew in another folder") as refused:
+        prepare(RunConfig(method="none", **kind), tmp_path, resume=True)
+    assert "--from-logs" not in str(refused.value)
 
 
 @pytest.mark.parametrize("logs", [(), ("runs/a",)])
@@ -255,6 +263,41 @@ def test_only_a_run_in_which_nothing_has_begun_may_end_at_once(launcher: Launche
     launcher.config = replace(launcher.config, flights=())
     say(launcher, STEP, pb.Step(header=pb.Header(sequence=1), actor="a"))
     assert launcher._begun()
+
+
+@pytest.mark.parametrize("error", [errno.EACCES, errno.EPERM, errno.EROFS])
+def test_a_run_goes_on_where_no_link_can_be_made(tmp_path: Path, monkeypatch, caplog, error: int) -> None:
+    """On a disk without links, or in the only writable folder, the training ended before it began."""
+
+    def refuse(self: Path, *_: object) -> None:
+        raise OSError(error, os.strerror(error), str(self))
+
+    (tmp_path / "run").mkdir()
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    Launcher(RunConfig(), tmp_path / "run", BusSettings(listen=("tcp/127.0.0.1:7447",)))._claim_folder()
+    assert (tmp_path / "run" / CONFIG).exists() and [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert f"{tmp_path}/latest does not point to this run: " in caplog.text
+
+
+def test_two_runs_that_start_at_once_do_not_take_the_link_from_each_other(tmp_path: Path, monkeypatch) -> None:
+    """The second found the link of the first in its place, and ended."""
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    launchers = [
+        Launcher(RunConfig(), tmp_path / name, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+        for name in ("first", "second")
+    ]
+    link, pid = Path.symlink_to, os.getpid()
+
+    def link_after_the_other(self: Path, target: str) -> None:
+        monkeypatch.setattr(Path, "symlink_to", link)
+        monkeypatch.setattr(os, "getpid", lambda: pid + 1)
+        launchers[1]._claim_folder()
+        link(self, target)
+
+    monkeypatch.setattr(Path, "symlink_to", link_after_the_other)
+    launchers[0]._claim_folder()
+    assert (tmp_path / "latest").readlink() == Path("first")
 
 
 def test_a_run_that_is_resumed_as_the_latest_stays_the_latest(tmp_path: Path) -> None:
