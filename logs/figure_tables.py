@@ -180,6 +180,8 @@ def for_clearance(figures: Figures) -> str:
     """Describe how many verified proposals the filter replaced to keep the clearance margin."""
     if figures["for_clearance"] is None:
         return "not recorded by this method or version"
+    if not figures["adjusted"]:
+        return "0"
     return f"{figures['for_clearance']} of {figures['adjusted']} adjusted steps: the filter verified the proposal too"
 
 

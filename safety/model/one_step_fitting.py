@@ -27,6 +27,7 @@ from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import (
     RARE,
     Shape,
+    least_half_widths,
     plans_from,
     shape_with_chords,
     shares,
@@ -182,7 +183,8 @@ def fit_one_step(
     factors = SetFactors.of(scores, others, kinds, model_config.outside, same=joint_space)
     one_step = replace(regression.fit(chosen, weight=choice.weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.level)
+    least = least_half_widths(robot, s.after)
+    shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.level, least)
     n, N = s.after.shape[2], robot.horizon
     first, later, of_chords = scales(robot, factors, n)
     steps = tuple(shape.bound(robot, k, slice(n), first if k == 1 else later) for k in range(1, N + 1))
@@ -272,13 +274,14 @@ def _shares_used(robot: Robot, s: Samples, regression: Regression, choice: Choic
 
     The last coordinate is the chord deviation.
     """
-    used = np.zeros((*s.after.shape[:2], s.after.shape[2] + 1))
+    used, least = np.zeros((*s.after.shape[:2], s.after.shape[2] + 1)), least_half_widths(robot, s.after)
     for i in regression.folds:
         progress(CHOSEN + (SCORED - CHOSEN) * i / len(regression.folds))
         held = s.fold == i
         one_step = regression.fit(choice.candidate, i, choice.weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], choice.full, choice.level)
+        z, chords, rest = s.z[~held], s.chords[~held], errors[~held]
+        shape = shape_with_chords(robot, z, rest, chords, choice.full, choice.level, least)
         used[held] = window_shares(errors[held], s.chords[held], shape.widths(spread_features(robot, s.z[held])))
     return used
 

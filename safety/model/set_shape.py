@@ -20,6 +20,7 @@ RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
 MOST_TYPICAL = 5_000  # windows from whose starts the typical plans begin: more hardly change their mean
 CHORD_INFLATION = 1.15  # on the chord deviations' shape, because calibration scales all parts by one factor
+RESOLUTION = 1e-5  # of a coordinate's largest change, to which sets hold: a learner's actions have single precision
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 
 
@@ -187,17 +188,31 @@ def shares(errors: Array, widths: Array) -> Array:
     return np.where(np.isnan(ratios) | np.isnan(widths), np.inf, ratios)
 
 
-def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, full: Array, level: int) -> Shape:
-    """Return the shape of all errors but rare ones, and of the chord deviations as a further coordinate."""
+def least_half_widths(robot: Robot, after: Array) -> Array:
+    """Return the least half-widths (N, n') of sets whose recorded outputs are `after` (T, N, n')."""
+    largest = np.abs(after).max(0)
+    d = robot.position_dim
+    largest[:, :d] = largest[:, :d].max(1, keepdims=True, initial=0.0)  # a path that hardly curves may lie askew
+    return np.asarray(RESOLUTION * largest)
+
+
+def shape_with_chords(
+    robot: Robot, z: Array, errors: Array, chords: Array, full: Array, level: int, least: Array
+) -> Shape:
+    """Return the shape of all errors but rare ones, and of the chord deviations as a further coordinate.
+
+    least (N, n'): the least half-widths of the errors (`least_half_widths`).
+    """
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     both = np.concatenate([errors[some], chords[some, :, None]], axis=2)
     plans = typical_plans(robot, z[some], full)
     others = slice(robot.position_dim, robot.state_dim)
     shape = Shape.around(spread_features(robot, z[some]), both, plans, level=level, outside=RARE, others=others)
     shape.slopes[:, -1] *= CHORD_INFLATION
+    shape.w[:, :-1] = np.maximum(shape.w[:, :-1], least)
     if robot.position_dim:
-        least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
+        chord = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
     else:
-        least = LEAST_CHORD * float((np.abs(robot.limit_weights) @ shape.w[-1, :-1] / robot.limit_scales).mean())
-    shape.w[:, -1] = np.maximum(CHORD_INFLATION * shape.w[:, -1], least)
+        chord = LEAST_CHORD * float((np.abs(robot.limit_weights) @ shape.w[-1, :-1] / robot.limit_scales).mean())
+    shape.w[:, -1] = np.maximum(CHORD_INFLATION * shape.w[:, -1], chord)
     return shape

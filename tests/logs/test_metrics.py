@@ -61,6 +61,7 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
     assert (figures["adjusted"], figures["for_clearance"]) == (1, None)
     assert closed_loop([new, old])["for_clearance"] is None and closed_loop([])["for_clearance"] == 0
     assert for_clearance(figures) == "not recorded by this method or version"
+    assert for_clearance(closed_loop([])) == "0", "a run without a filter has none either"
 
 
 @pytest.mark.parametrize("indexed", [True, False])
