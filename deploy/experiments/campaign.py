@@ -222,6 +222,7 @@ def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str,
         "model_set": cell.model_set,
         "perturbation": cell.perturbation,
         "model": cell.model or "none",
+        "weights": cell.weights,
         "versions": sorted({result.get("versions", NOT_STATED) for result in results}),
         "episodes": episodes,
         "steps": count["steps"],
@@ -255,14 +256,22 @@ def table_of(path: Path) -> dict[str, Any]:
 
 
 def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Path) -> None:
-    """Raise ResultError if cells of earlier campaigns would stand beside cells of another version of a model set."""
+    """Raise ResultError if cells of earlier campaigns would stand beside cells of another model set or policy."""
     driven_again = {(cell.arena, Path(cell.policy).stem, cell.model_set, cell.perturbation) for cell in cells}
     versions = {cell.model_set: cell.model or "none" for cell in cells}
+    weights = {Path(cell.policy).stem: cell.weights for cell in cells}
     for one in table["cells"]:
-        if _cell_key(one) not in driven_again and one["model"] != versions.get(one["model_set"], one["model"]):
+        if _cell_key(one) in driven_again:
+            continue
+        what = ""
+        if one["model"] != versions.get(one["model_set"], one["model"]):
+            what = f"the model set {one['model']}, which is now {versions[one['model_set']]}"
+        elif one.get("weights") and one["weights"] != weights.get(one["policy"], one["weights"]):
+            what = f"an earlier policy {one['policy']}"
+        if what:
             raise ResultError(
-                f"{path} holds cells of the model set {one['model']}, which is now {versions[one['model_set']]}: drive "
-                "these cells again in the same campaign, move the file away, or give another --results"
+                f"{path} holds cells of {what}: drive these cells again in the same campaign, move the file away, or "
+                "give another --results"
             )
 
 
@@ -296,7 +305,12 @@ def cell_table(cells: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[st
         ],
         "run into, standing": [str(cell.get("contacts_standing", 0)) for cell in cells],
         "interventions": [
-            _percent(cell["interventions"], cell["steps"], cell["interventions_interval"]) for cell in cells
+            _percent(
+                cell["interventions"],
+                cell["steps"] if cell["model_set"] != "none" else 0,
+                cell["interventions_interval"],
+            )
+            for cell in cells
         ],
         "steps outside": [
             _percent(cell["violations"], cell["compared"], cell["violations_interval"]) for cell in cells

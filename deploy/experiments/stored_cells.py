@@ -47,6 +47,32 @@ def stored_cells(results: Path, robot: str) -> list[dict[str, Any]]:
     return cells
 
 
+def stored_tunings(folder: Path, physics: int) -> dict[str, list[dict[str, Any]]]:
+    """Return the stored values of each method's setting in the folder of a robot, in their order.
+
+    Args:
+        folder: of the robot.
+        physics: version of the simulator that made the cells beside them.
+
+    Raises:
+        ResultError: a file is damaged, a copy, or of another version of the simulator.
+    """
+    tried: dict[str, list[dict[str, Any]]] = {}
+    for path in sorted(folder.glob("tuning-*.json")):
+        result = stored_result(path)
+        study, value = result["study"], f"{result['value']:g}"
+        if path.stem != f"tuning-{study['method']}-{value}":
+            raise ResultError(f"{path} holds the value {value} of {study['method']}: move it away")
+        version = study.get("cell", study).get("physics", 1)
+        if version != physics:
+            raise ResultError(
+                f"{path} is of version {version} of the simulator, the cells of {physics}: run it again with --tune "
+                "--again, or move it away"
+            )
+        tried.setdefault(study["method"], []).append(result)
+    return {method: sorted(values, key=lambda row: float(row["value"])) for method, values in tried.items()}
+
+
 def check_addable(results: Path, cells: Sequence[CellConfig]) -> None:
     """Raise ResultError if cells to run would not compare with the stored ones that they do not replace."""
     folder, names = robot_folder(results, cells[0].robot), {cell.name for cell in cells}
@@ -77,9 +103,9 @@ def _check_episodes(cells: Sequence[dict[str, Any]], folder: Path) -> None:
             trial = evaluation_name(cell["study"]["method"], arena)
             if trial not in cell["evaluations"]:
                 raise ResultError(f"{path} has no evaluation {trial}: run it again with --again, or move it away")
-            episodes = cell["evaluations"][trial]["episodes"]
-            _check_columns(episodes, f"{path}: the episodes of {trial}")
-            counts.setdefault(trial, set()).add(len(episodes["goal"]))
+        for trial, evaluation in cell["evaluations"].items():
+            _check_columns(evaluation["episodes"], f"{path}: the episodes of {trial}")
+            counts.setdefault(trial, set()).add(len(evaluation["episodes"]["goal"]))
     if several := [f"{trial} ({', '.join(map(str, sorted(n)))})" for trial, n in counts.items() if len(n) > 1]:
         raise ResultError(f"{folder}: the cells have more than one number of episodes in {several[0]}")
 

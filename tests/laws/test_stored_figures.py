@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import evaluation_name, steps_to_learn
@@ -102,6 +104,18 @@ def test_the_pages_say_what_ours_reaches_without_turning_aside(name: str) -> Non
     default, dense = percents(stored, "goal").split(", ")
     assert f"{default} and {dense}" in text or f"{default} and, in `dense`, {dense}" in text
     assert f"{np.mean(learned(stored)):,.0f}" in text
+
+
+@pytest.mark.parametrize(("page", "robot"), [("docs/results.md", "ground"), ("docs/results_quadrotor.md", "quadrotor")])
+def test_the_pages_say_how_sure_the_difference_to_the_barrier_function_is(page: str, robot: str) -> None:
+    """Welch's interval of the difference of the mean shares of goals in `dense`, over the runs."""
+    ours, theirs = (np.array(shares(cells(robot, method), "dense", "goal")) for method in ("ddpc", "cbf"))
+    parts = [np.var(runs, ddof=1) / len(runs) for runs in (ours, theirs)]
+    freedom = sum(parts) ** 2 / sum(part**2 / (len(ours) - 1) for part in parts)
+    difference, half = np.mean(ours) - np.mean(theirs), stdtrit(freedom, 0.975) * math.sqrt(sum(parts))
+    text = " ".join((ROOT / page).read_text().split())
+    assert f"{100 * difference:.1f} percentage points" in text
+    assert f"{100 * (difference - half):.1f} to {100 * (difference + half):.1f} by Welch's t-test" in text
 
 
 def sac_cells(robot: str, method: str, rate: float) -> list[dict[str, Any]]:

@@ -81,6 +81,17 @@ def test_a_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
     assert 0.84 <= covered / 100 <= 0.98
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("runs", "name", "share"), [(5, "mean", 0.83), (5, "iqm", 0.90), (4, "mean", 0.81), (3, "mean", 0.74)]
+)
+def test_a_bootstrap_interval_of_few_runs_is_as_narrow_as_the_pages_say(runs: int, name: str, share: float) -> None:
+    """`docs/results.md` and the results page state these shares for normally distributed scores."""
+    scores = np.random.default_rng(2).standard_normal((2000, runs))
+    intervals = np.array([aggregate(values)[f"{name}_interval"] for values in scores])
+    assert np.mean((intervals[:, 0] <= 0.0) & (intervals[:, 1] >= 0.0)) == pytest.approx(share, abs=0.025)
+
+
 def test_a_run_that_ended_early_cuts_no_other() -> None:
     (group,) = compare_groups([run("long", "ddpc", 0, 0.9), run("short", "ddpc", 1, 0.5, steps=1000)])["groups"]
     curves, steps = group["curves"], group["steps"]

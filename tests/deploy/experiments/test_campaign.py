@@ -195,6 +195,34 @@ def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has
         command.run()
 
 
+def test_a_table_refuses_cells_of_an_earlier_policy_of_the_same_name(driven, monkeypatch, tmp_path):
+    """`trained` may be trained anew between two campaigns, whose cells would then be those of two policies."""
+    _, (first, _), _ = driven
+    monkeypatch.setattr(experiment_jobs, "complete", lambda jobs, *_: [first] if jobs else [])
+    settings = {"engine": IN_THIS_PROCESS, "results": tmp_path, "runs": tmp_path / "runs", "quiet": True}
+    command = CampaignCommand(
+        arenas=("default",), policies=("trained",), model_sets=("residual",), episodes=4, **settings
+    )
+    command.run()
+    path = tmp_path / "ground.json"
+    table = json.loads(path.read_text())
+    assert table["cells"][0]["weights"]
+    table["cells"][0]["weights"] = "another"
+    path.write_text(json.dumps(table))
+    with pytest.raises(ResultError, match="holds cells of an earlier policy trained"):
+        replace(command, arenas=("dense",)).run()
+    command.run()
+    replace(command, arenas=("dense",), policies=("random",)).run()
+    assert [cell["policy"] for cell in json.loads(path.read_text())["cells"]] == ["trained", "random"]
+
+
+def test_a_robot_without_a_filter_has_no_share_of_interventions():
+    row = {name: [value] for name, value in ROW.items()}
+    cells = cells_of([replace(CELL, model_set="none"), CELL], [{"episodes": row, "near": []}] * 2, Path("runs"))
+    heads, rows = cell_table([cell | {"interventions_interval": (0.0, 0.5)} for cell in cells])
+    assert [row[heads.index("interventions")] for row in rows] == ["–", "0.00 % [0.00, 50.00]"]
+
+
 def test_a_table_keeps_the_cells_of_a_campaign_that_ended_meanwhile(driven, monkeypatch, tmp_path):
     _, (first, _), _ = driven
     settings = {"engine": IN_THIS_PROCESS, "results": tmp_path, "quiet": True}

@@ -234,6 +234,11 @@ def with_fewer_episodes(cell):
         column.pop()
 
 
+def with_fewer_crossed_episodes(cell):
+    for column in cell["evaluations"]["untrained-ddpc-default"]["episodes"].values():
+        column.pop()
+
+
 def without_a_number(cell):
     cell["training"]["episodes"]["reward"][3] = float("nan")
 
@@ -244,6 +249,7 @@ def without_a_number(cell):
         (without_an_arena, r"none-s0\.json has no evaluation trained-none-dense"),
         (without_an_episode, r"none-s0\.json: the episodes of trained-none-dense"),
         (with_fewer_episodes, "more than one number of episodes in trained-none-dense"),
+        (with_fewer_crossed_episodes, "more than one number of episodes in untrained-ddpc-default"),
         (without_a_number, r"none-s0\.json: the episodes of the training"),
     ],
 )
@@ -304,6 +310,14 @@ def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(results):
     text = page(results, ["ground"])
     assert "| CBF-QP | rate α [1/s] | **0.5**: A* 60 goals; greedy 20, 1 collisions |" in text
     assert "**30**: 118 goals, 30 collisions; 7 in training | 0.1 | 1 |" in text
+    path = results / "ground" / "tuning-cbf-0.5.json"
+    change(path, lambda row: row["study"].update(physics=1))
+    with pytest.raises(ResultError, match=r"tuning-cbf-0\.5\.json is of version 1 of the simulator, the cells of 2"):
+        page(results, ["ground"])
+    change(path, lambda row: row["study"].update(physics=2))
+    path.with_name("tuning-cbf-8.json").write_text(path.read_text())
+    with pytest.raises(ResultError, match=r"tuning-cbf-8\.json holds the value 0\.5 of cbf"):
+        page(results, ["ground"])
 
 
 def test_the_best_learner_has_the_fewest_collisions_of_those_that_reach_the_goal():
