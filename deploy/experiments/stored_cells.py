@@ -98,11 +98,11 @@ def _check_episodes(cells: Sequence[dict[str, Any]], folder: Path) -> None:
     counts: dict[str, set[int]] = {}
     for cell in cells:
         path = folder / f"{short_name(cell['study']['method'])}-s{cell['study']['seed']}.json"
+        trials = [evaluation_name(cell["study"]["method"], arena) for arena in cell["study"]["arenas"]]
+        missing = [f"evaluation {trial}" for trial in trials if trial not in cell.get("evaluations", {})]
+        if missing := (["training"] if "training" not in cell else []) + missing:
+            raise ResultError(f"{path} has no {missing[0]}: run it again with --again, or move it away")
         _check_columns(cell["training"]["episodes"], f"{path}: the episodes of the training")
-        for arena in cell["study"]["arenas"]:
-            trial = evaluation_name(cell["study"]["method"], arena)
-            if trial not in cell["evaluations"]:
-                raise ResultError(f"{path} has no evaluation {trial}: run it again with --again, or move it away")
         for trial, evaluation in cell["evaluations"].items():
             _check_columns(evaluation["episodes"], f"{path}: the episodes of {trial}")
             counts.setdefault(trial, set()).add(len(evaluation["episodes"]["goal"]))

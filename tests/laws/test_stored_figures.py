@@ -143,7 +143,9 @@ def test_the_table_of_sacs_learning_rates_has_the_stored_figures() -> None:
             collided = [sum(cell["training"]["episodes"]["collision"]) for cell in stored]
             expected = f"{np.mean(learned(stored)):,.0f}", percents(stored, "goal", " and ")
             assert figures == [*expected, f"{np.mean(collided):.0f}"], (rate, method)
-            spelled = f"{NUMBERS[len(stored)]} seed", f"seeds {', '.join(map(str, seeds(stored)))}"
+            numbers = seeds(stored)
+            spelled = [f"{NUMBERS[len(stored)]} seed", f"seeds {', '.join(map(str, numbers))}"]
+            spelled += [f"seeds {numbers[0]} to {numbers[-1]}"] * (numbers == [*range(numbers[0], numbers[-1] + 1)])
             assert any(words in place for words in spelled), (rate, method, place)
 
 
@@ -168,7 +170,7 @@ def test_the_table_of_other_settings_has_the_stored_figures() -> None:
     """One seed: numbers of collisions; several: shares. A row of SAC without a stored cell says so."""
     tied = set()
     for label, *row in table_rows("docs/results_quadrotor.md", "| training | seeds | goals | collisions |"):
-        rate = re.fullmatch(r"SAC behind our filter, (?:learning )?rate (0\.\d+)", label)
+        rate = re.fullmatch(r"SAC behind our filter, (?:(?:learning )?rate )?(0\.\d+)(?:, .*)?", label)
         if not rate and label not in OTHERS:
             continue
         stored = sac_cells("quadrotor", "sac-ddpc", float(rate[1])) if rate else cells(*OTHERS[label])
