@@ -39,6 +39,8 @@ class DecisionArrays:
     >>> answers = Filter.load("ground").decide_batch(RequestArrays.of([request] * 3))
     >>> [KINDS[kind] for kind in answers.kind], answers.plan[:, 0].tolist()
     (['allowed', 'allowed', 'allowed'], [[0.2, 0.0], [0.2, 0.0], [0.2, 0.0]])
+    >>> answers
+    DecisionArrays(3 allowed)
 
     Attributes:
         kind (B,): index in `KINDS`: 0 allowed, 1 adjusted, 2 failsafe, 3 recovering.
@@ -102,6 +104,11 @@ class DecisionArrays:
 
     def __len__(self) -> int:
         return int(self.kind.shape[0])
+
+    def __repr__(self) -> str:
+        counts = np.bincount(on_host(self.kind), minlength=len(KINDS))
+        listed = ", ".join(f"{count} {kind}" for kind, count in zip(KINDS, counts, strict=True) if count)
+        return f"DecisionArrays({listed})"
 
     def row(self, index: int) -> Decision:
         """Return the decision about one robot, as NumPy arrays. A negative index counts from the end."""
