@@ -42,6 +42,8 @@ from brakeline.deploy.option_numbers import check_option_numbers
 from brakeline.extras import missing_extra
 from brakeline.messaging.stop_signals import interrupt_on_signals
 
+LEAST_COLUMNS = 8  # of a terminal: with fewer, rich prints nothing, and tyro's help does not end
+
 # tyro shows `X | None` as `{None}|X`, takes the word None, and names Python's NoneType if it can't parse a value. An
 # option that is left out is None already, so that only X is shown and parsed.
 registry = ConstructorRegistry()
@@ -264,6 +266,8 @@ def main(arguments: list[str] | None = None) -> int:
     """
     if isinstance(sys.stdout, TextIOWrapper) and codecs.lookup(sys.stdout.encoding).name != "utf-8":
         sys.stdout.reconfigure(errors="replace")  # a locale without a letter such as ≤ must not end a command
+    if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]) < LEAST_COLUMNS:
+        del os.environ["COLUMNS"]  # such as 0, which some programs set in a shell without a terminal
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes with two threads each on two cores are slower
     words = sys.argv[1:] if arguments is None else arguments
     errors = Console(stderr=True, highlight=False)

@@ -268,15 +268,21 @@ class RunBusOptions:
         """Return the bus settings of the launcher. Makes the run's own keys if the run needs any.
 
         Raises:
-            ValueError: the port is 0, so that the run's processes could not know it.
+            ValueError: the port is 0, so that the run's processes could not know it; or there are too few ports for
+                the metrics of the processes.
         """
         if self.listen and self.listen.partition("#")[0].endswith(":0"):
             raise ValueError(f"--listen {self.listen}: give a port, or leave it out for a free port of this machine")
+        from brakeline.deploy.run.processes import process_specs
         from brakeline.deploy.run.run_keys import make_run_keys
         from brakeline.messaging.bus import BusSettings
         from brakeline.messaging.bus.bus_settings import local
         from brakeline.messaging.free_ports import free_endpoint
+        from brakeline.messaging.http_server import LARGEST_PORT
 
+        port, last = self.metrics.rpartition(":")[2], LARGEST_PORT - len(process_specs(config))
+        if port.isdecimal() and not 1 <= int(port) <= last:
+            raise ValueError(f"--metrics {self.metrics}: the run's processes use the next ports, so give 1 to {last}")
         keys = self.keys or default_keys() or (make_run_keys(config, folder) if self.secured else None)
         endpoints: tuple[str, ...] = (free_endpoint("tcp" if keys is None else "tls"),)
         if self.listen:

@@ -59,6 +59,8 @@ STATED = {
         ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "there are: crossing, default"),
         ("train ground --arena ballroom --out {folder}/run", "no arena is called 'ballroom'; there are: crossing"),
         ("train ground --method none --listen tls/127.0.0.1:0 --out {folder}/run", "give a port, or leave it out"),
+        ("train ground --method none --metrics 0 --out {folder}/run", "use the next ports, so give 1 to 65531"),
+        ("train ground --method none --metrics 65535 --out {folder}/run", "use the next ports, so give 1 to 65531"),
         ("train submarine --out {folder}/run", "no robot is called 'submarine'; there are: ground"),
         ("train ground --from-logs {folder}/none --out {folder}/run", "no log at"),
         ("train ground --resume {folder}/none", "is no run's configuration"),

@@ -1,5 +1,6 @@
 """Test the help of the command line, and the answers to typing errors."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -39,6 +40,18 @@ def test_every_example_is_understood(name, monkeypatch):
     understood = []
     monkeypatch.setattr(command_class(name), "run", lambda self: understood.append(self) or 0)
     assert main(shlex.split(COMMANDS[name].example)[1:]) == 0 and understood
+
+
+@pytest.mark.parametrize("columns", ["0", "5"])
+@pytest.mark.parametrize("words", [["--help"], ["status", "--help"], ["robot", "show", "ground"]])
+def test_a_terminal_without_width_shows_everything(columns, words):
+    """Before, the first and the last printed nothing, or the help of a command did not end."""
+    script = f"import sys; from brakeline.deploy.cli import main; sys.exit(main({words}))"
+    environment = os.environ | {"COLUMNS": columns}
+    done = subprocess.run(
+        [sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=60, env=environment
+    )
+    assert done.returncode == 0 and len(done.stdout) > 400, done.stderr
 
 
 def test_a_typing_error_is_answered_with_a_suggestion(command):
