@@ -162,6 +162,7 @@ OTHERS = {  # rows of the table of other settings, with the folder and the metho
     "SAILR, η = 0.15": ("former_settings/quadrotor", "sailr"),
     "CBF-QP, α = 2": ("former_settings/quadrotor", "cbf"),
     "SECAS, margin 0.4 m": ("former_settings/quadrotor", "secas"),
+    "SECAS, penalty for corrections 12": ("secas_penalty_12/quadrotor", "secas"),
     "TD3-Lagrange, multiplier rate 1": ("lagrange/quadrotor", "lagrange"),
 }
 
