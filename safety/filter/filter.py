@@ -202,7 +202,7 @@ class Filter:
         unsure = "" if tube_kernels.within(z_0, self.domain) else UNRECORDED
         if not unsure and may_drive_already(request, self.robot):
             _, constraints, stay = self._rest_of_plan(request, local_map, z_0)
-            unsure = "" if stands(request, local_map, constraints, stay) else DRIVES_ALREADY
+            unsure = "" if stands(request, local_map, constraints, stay, self.start) else DRIVES_ALREADY
         candidate = None
         if blind or unsure:
             record.reason = blind or unsure
@@ -303,7 +303,7 @@ class Filter:
         before = z_0[-self.robot.action_dim :]
         tail, constraints, as_committed = self._rest_of_plan(request, local_map, z_0)
         was_verified = request.model == self.version and not record.broken
-        was_verified |= stands(request, local_map, constraints, as_committed)
+        was_verified |= stands(request, local_map, constraints, as_committed, self.start)
         if request.touches_another:
             record.reason += "; the robot's reservation touches another robot's"
             was_verified = False

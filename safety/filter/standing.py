@@ -16,7 +16,7 @@ DRIVES_ALREADY = (
 )
 
 
-def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array) -> bool:
+def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, z: Array, start: float) -> bool:
     """Return whether the robot stands and its plan is to go on standing. Such a plan needs no verification.
 
     The first request of a program contains no prediction, and the robot may be driving already. Then the robot counts
@@ -25,15 +25,18 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
 
     Args:
         z: regressors of the plan.
+        start: factor on the sets at the start of an episode (`Filter.start`). The sets count with this factor alone: a
+            robot does not stand because its sets were widened.
     """
     robot = constraints.robot
     if not request.still(robot) or request.predicted is not None:
         return request.still(robot)
+    constraints = constraints.at(z, start)
     if robot.position_dim:
         centers, half = constraints.sets(local_map.start, local_map.turn, z)
         return bool((np.abs(centers - local_map.start) <= half + constraints.measurement_error).all())
     limited, tube = list(extra_coordinates(robot)), constraints.tube
-    half = constraints.widening * tube.more_half_widths(z) + np.asarray(robot.measurement_bound)[limited]
+    half = start * tube.more_half_widths(z) + np.asarray(robot.measurement_bound)[limited]
     return bool((np.abs(tube.more_offset - request.state[limited]) <= half).all())
 
 

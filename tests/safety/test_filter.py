@@ -27,15 +27,15 @@ from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
 
 
-@pytest.mark.parametrize(("speed", "gap"), [(1.0, 0.2), (3.0, 0.65), (6.0, 4.0)])
-def test_a_robot_that_flies_when_its_program_begins_has_no_verified_plan_to_stand(speed, gap):
-    """Its first request names no plan, as that of a standing robot does."""
+@pytest.mark.parametrize(("speed", "gap", "widening"), [(1.0, 0.2, 1), (3.0, 0.65, 1), (6.0, 4.0, 1), (3.0, 0.65, 3)])
+def test_a_robot_that_flies_when_its_program_begins_has_no_verified_plan_to_stand(speed, gap, widening):
+    """Its first request names no plan, as that of a standing robot does. A client keeps its widening after a reset."""
     ready, rng = Filter.load("quadrotor"), np.random.default_rng(0)
     ahead = Shapes.of([Obstacle("sphere", (QUADROTOR.footprint + gap + 0.5, 0.0, 0.0), (0.5,))], 3)
     hover = np.zeros((QUADROTOR.horizon, 3))
     flying = np.array([0.0, 0.0, 0.0, speed, *np.zeros(5)])
     first = Request(state=flying, action=np.array([5.0, 0, 0]), input_in_force=hover[0], plan=hover, obstacles=ahead)
-    decision = ready.decide(first)
+    decision = ready.decide(replace(first, widening=float(widening)))
     assert (decision.kind, decision.verified) == (FAILSAFE, False)
     bound = np.array(QUADROTOR.measurement_bound)
     for state in rng.uniform(-bound, bound, (50, 9)):  # one that stands, as it may be measured
