@@ -150,7 +150,7 @@ class TubeConstraints:
             self.widest = widest_extent(robot, tube, outer, domain, self.body)
             wanted = self.widest + clearance.largest
             self.reach = min(wanted, robot.sight) if reach is None else reach
-            self.far = wanted > robot.sight or isinstance(tube, RolloutTube)  # interval arithmetic bounds no rollout
+            self.far = wanted > self.reach or isinstance(tube, RolloutTube)  # interval arithmetic bounds no rollout
         else:  # nothing is near or far: the reach only bounds margins
             self.widest, self.reach, self.far = 0.0, FARTHEST, False
         self._surround(tube, 1.0)

@@ -113,7 +113,7 @@ class PlanSearch:
         z = safety.inputs.regressors(self.z_0, self.proposal)
         everywhere = local_map.empty and safety.constraints.limits is None
         constraints = safety.constraints_for(z, local_map.widening)
-        if everywhere and not safety.constraints.far and local_map.widening == 1.0:
+        if everywhere and not constraints.far and local_map.widening == 1.0:
             return PlanCandidate(ALLOWED, safety.inputs.plan(z), z, safety.reach, True, constraints)
         enough = max(safety.clearance_margin, 0.0)
         if everywhere and (margin := constraints.least(NO_ROWS, z)) >= enough:

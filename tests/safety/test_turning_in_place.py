@@ -194,6 +194,15 @@ def test_the_predictors_in_place_serve_a_standing_robots_plans_in_place_and_no_o
         assert ready.constraints_for(moving) is ready.constraints
 
 
+def test_an_obstacle_beyond_the_reach_of_plans_counts_in_wider_tubes_of_turns(turner):
+    """The map of the surroundings ends at the reach of all plans, and the tube of a turn went on behind it."""
+    wide = tuple(replace(step, w=step.w + 2.0) for step in turner.in_place.steps)
+    wider = replace(turner, robot=replace(ROBOT, sight=50.0), in_place=replace(turner.in_place, steps=wide))
+    ready = Filter(wider, clearance_margin=0.01)
+    answer = InProcess(ready, accept_bound=1.0).decide([0.0] * 5, [0.0, FAST], [cylinder(ready.reach + 0.15, 0.0)])
+    assert ready.reach < 1.5 and answer.kind != ALLOWED
+
+
 def test_a_robot_that_never_turns_in_place_has_no_predictors_in_place():
     assert standing_limits(QUADROTOR) is None
     assert fitted(record(2, trajectories=15, turns=False)).in_place is None
