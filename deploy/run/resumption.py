@@ -48,10 +48,11 @@ def check_resumable(config: RunConfig, folder: Path) -> None:
 
 def _without_checkpoint(config: RunConfig, folder: Path) -> str:
     """Say how a training without a checkpoint can go on."""
-    anew = "egin anew in another folder: --out"
     if config.backend == BATCH or config.deterministic:
-        return f"B{anew} (a run with --backend batch or --deterministic does not learn from its log)"
-    return f"Learn again from the run's log: `brakeline train --resume {folder} --from-logs {folder}`. Or b{anew}"
+        why = "a run with --backend batch or --deterministic does not learn from its log"
+        return f"Begin anew in another folder: --out ({why})"
+    again = f"`brakeline train --resume {folder} --from-logs {folder}`"
+    return f"Learn again from the run's log: {again}. Or begin anew in another folder: --out"
 
 
 def _within(folder: Path, path: Path) -> bool:

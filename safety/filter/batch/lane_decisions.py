@@ -130,7 +130,7 @@ class LaneDecisions:
         return good & ~self._may_drive_already(requests)
 
     def _may_drive_already(self, requests: RequestArrays) -> Array:
-        """Return which rows (B,) are those of `standing.may_drive_already`."""
+        """Return the rows (B,) of `standing.may_drive_already`, and perhaps more: all of them are decided singly."""
         xp, model = self._xp, requests.model
         names = [model] * len(requests) if isinstance(model, str) else model
         first = xp.asarray(np.array([not name for name in names], dtype=bool), device=self._device)

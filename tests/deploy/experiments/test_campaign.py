@@ -172,13 +172,16 @@ def test_each_task_and_each_robot_of_ones_own_has_a_table_of_its_own(driven, mon
     assert experiment_jobs.result_path(tmp_path / "runs", own) == tmp_path / "runs" / "my" / f"{own.name}.json"
 
 
-def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has_changed(driven, monkeypatch, tmp_path):
+def command_that_finds(driven, policy, monkeypatch, folder):
+    """Return a campaign of one cell of a policy, which finds its part driven already."""
     _, (first, _), _ = driven
     monkeypatch.setattr(experiment_jobs, "complete", lambda jobs, *_: [first] if jobs else [])
-    settings = {"engine": IN_THIS_PROCESS, "results": tmp_path, "runs": tmp_path / "runs", "quiet": True}
-    command = CampaignCommand(
-        arenas=("default",), policies=("random",), model_sets=("residual",), episodes=4, **settings
-    )
+    settings = {"engine": IN_THIS_PROCESS, "results": folder, "runs": folder / "runs", "quiet": True}
+    return CampaignCommand(arenas=("default",), policies=(policy,), model_sets=("residual",), episodes=4, **settings)
+
+
+def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has_changed(driven, monkeypatch, tmp_path):
+    command = command_that_finds(driven, "random", monkeypatch, tmp_path)
     for arena in ("default", "dense", "default"):
         replace(command, arenas=(arena,)).run()
     path = tmp_path / "ground.json"
@@ -197,12 +200,7 @@ def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has
 
 def test_a_table_refuses_cells_of_an_earlier_policy_of_the_same_name(driven, monkeypatch, tmp_path):
     """`trained` may be trained anew between two campaigns, whose cells would then be those of two policies."""
-    _, (first, _), _ = driven
-    monkeypatch.setattr(experiment_jobs, "complete", lambda jobs, *_: [first] if jobs else [])
-    settings = {"engine": IN_THIS_PROCESS, "results": tmp_path, "runs": tmp_path / "runs", "quiet": True}
-    command = CampaignCommand(
-        arenas=("default",), policies=("trained",), model_sets=("residual",), episodes=4, **settings
-    )
+    command = command_that_finds(driven, "trained", monkeypatch, tmp_path)
     command.run()
     path = tmp_path / "ground.json"
     table = json.loads(path.read_text())
