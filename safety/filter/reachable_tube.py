@@ -143,7 +143,7 @@ class RolloutTube(Tube):
         from brakeline.safety.filter.kernels import rollout_kernels
 
         sets = np.ascontiguousarray(self.directions), np.ascontiguousarray(self.more_directions)
-        predictor = self.one_step.stretch_arguments(self.robot)
+        predictor = self.one_step.rollout_arguments(self.robot)
         return partial(rollout_kernels.sets_around, *predictor, self.inputs_of, self._further, *sets)
 
     @cached_property

@@ -22,7 +22,7 @@ class WindowScore:
         W = np.ascontiguousarray(model.first.W)  # the same for all periods
         from brakeline.safety.filter.kernels import window_kernels
 
-        self._score = partial(window_kernels.score, *one_step.stretch_arguments(robot))
+        self._score = partial(window_kernels.score, *one_step.rollout_arguments(robot))
         self._sets = W, M, kappa, w, scored
         self._start = one_step.start
 

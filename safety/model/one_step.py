@@ -158,7 +158,8 @@ class OneStep:
         """Return the factors sqrt(1 + weight · leverage) on the sets (T, N) of windows z (T, r + m + N·m)."""
         from brakeline.safety.filter.kernels import window_rollout_kernels
 
-        return window_rollout_kernels.stretches(*self.stretch_arguments(robot), np.ascontiguousarray(z))
+        whole = np.ascontiguousarray
+        return window_rollout_kernels.stretches(self.arguments(robot), whole(self.root), self.weight, whole(z))
 
     def leverages(self, robot: Robot, z: Array) -> Array:
         """Return the leverages (T, N) of windows z (T, r + m + N·m), with which the sets grow."""
@@ -175,6 +176,9 @@ class OneStep:
         predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(terms)
         return *predictor, others, heading, centers, d, robot.action_dim
 
-    def stretch_arguments(self, robot: Robot) -> tuple[Predictor, Array, float]:
-        """Return the arguments of the kernels that know how the sets grow: also the root, and the weight."""
-        return self.arguments(robot), np.ascontiguousarray(self.root), self.weight
+    def rollout_arguments(self, robot: Robot) -> tuple[Predictor, Array, float]:
+        """Return the first arguments of the kernels that roll out one plan: also the transposed root, and the weight.
+
+        The root is transposed here, so that the kernel's inner loop runs along memory.
+        """
+        return self.arguments(robot), np.ascontiguousarray(self.root.T), self.weight

@@ -173,14 +173,9 @@ def regressors_of_braking(z_0, braking, action):
     return np.concatenate([z_0, (braking * action).ravel()])
 
 
-def rollout(predictor, window):
+def rollout(predictor, across, weight, window):
     """`rollout_kernels.rollout`."""
-    return rollouts(predictor, window[None])[0]
-
-
-def stretch(predictor, root, weight, window):
-    """`rollout_kernels.stretch`."""
-    return stretches(predictor, root, weight, window[None])[0]
+    return rollouts(predictor, window[None])[0], stretches(predictor, across.T, weight, window[None])[0]
 
 
 def turning(angle, d):
@@ -242,23 +237,23 @@ def affine(predictor, z, T, kept):
     return gradient[:, :d], offset[:, :d], gradient[:, kept], offset[:, kept]
 
 
-def sets_around(predictor, root, weight, T, kept, sets, more_sets, z):
+def sets_around(predictor, across, weight, T, kept, sets, more_sets, z):
     """`rollout_kernels.sets_around`."""
     window, n, d = (T @ z)[None], len(predictor[0]), predictor[7]
-    outputs, stretch = rollouts(predictor, window)[0], stretches(predictor, root, weight, window)[0]
+    outputs, stretch = rollout(predictor, across, weight, window[0])
     wide, more_wide = (stretch[:, None, None] * part for part in (sets, more_sets))
     return outputs[:, :d], wide, outputs[:, kept], more_wide, outputs[0, :n], stretch
 
 
-def score(predictor, root, weight, states, executed, W, M, kappa, w, scored):
+def score(predictor, across, weight, states, executed, W, M, kappa, w, scored):
     """`window_kernels.score`."""
     _, _, _, _, others, heading, _, d, _ = predictor
     window, after = np.concatenate([states[0, others], executed.ravel()]), states[1:].copy()
     after[:, :d] = (states[1:, :d] - states[0, :d]) @ turning(states[0, heading], d)
     after[:, heading] = np.angle(np.exp(1j * (states[1:, heading] - states[0, heading])))
     widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
-    off = np.abs(after - rollouts(predictor, window[None])[0, :, : states.shape[1]])
-    shares = off / (widths * stretches(predictor, root, weight, window[None])[0][:, None])
+    predicted, stretch = rollout(predictor, across, weight, window)
+    shares = np.abs(after - predicted[:, : states.shape[1]]) / (widths * stretch[:, None])
     of_scored = shares[:, scored].max()
     return max(of_scored, shares[0].max()), of_scored
 

@@ -107,7 +107,7 @@ def cases(rng, d):
     before, bounds = rng.uniform(low, high), np.stack([z - rng.uniform(-0.05, 1.0), z + 1.0])
     h, g, A, b = rng.uniform(0.1, 1.0, FREE), rng.normal(size=FREE), rng.normal(size=(30, FREE)), rng.normal(size=30)
     step = rng.normal(size=(9, NZ)), W_t, M_t[:, :9], rng.random((NZ, 9)), m_0[:9], rng.random((9, 9))
-    predictor, leverage = rollout_parts(rng, d), (np.tril(rng.normal(size=(12, 12))), rng.uniform(0.0, 3.0))
+    predictor, root, weight = rollout_parts(rng, d), np.tril(rng.normal(size=(12, 12))), rng.uniform(0.0, 3.0)
     plan = 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0
     presolve = presolve_arguments(rng, rng.uniform(0.0, 12.0))
     rows = presolve[:3]
@@ -131,16 +131,16 @@ def cases(rng, d):
         "sets": (*tube, z, start, turn, measured),
         "extent": (*tube, z, 0.105),
         "next_state": (*step, z, rng.normal(size=9), widening, start, turn),
-        "rollout": (predictor, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
-        "stretch": (predictor, *leverage, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
+        "rollout": (predictor, root.T, weight, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
         "rollouts": (predictor, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
-        "stretches": (predictor, *leverage, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
+        "stretches": (predictor, root, weight, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
         "affine": (predictor, *plan, np.array([d + 1, d])),
         "sets_around": (
-            *(predictor, *leverage, plan[1], np.array([d + 1, d]), directions, rng.normal(size=(N, 2, L)), plan[0]),
+            *(predictor, root.T, weight, plan[1], np.array([d + 1, d]), directions),
+            *(rng.normal(size=(N, 2, L)), plan[0]),
         ),
         "score": (
-            *(predictor, *leverage, rng.normal(size=(N + 1, d + 3)), 0.5 * rng.normal(size=(N + 1, 2))),
+            *(predictor, root.T, weight, rng.normal(size=(N + 1, d + 3)), 0.5 * rng.normal(size=(N + 1, 2))),
             *(rng.normal(size=(Q, 2 + 2 + 2 * N)), rng.random((N, d + 3, Q))),
             *(rng.random((N, d + 3, 2 + 2 + 2 * N)), rng.random((N, d + 3)), np.arange(d)),
         ),

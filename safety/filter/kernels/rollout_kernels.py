@@ -10,7 +10,7 @@ The parts of the predictor, and what else the functions share:
     heading             index of the heading in the state, -1 without one
     arms (D, d)         centers of the body's further discs, in the robot's frame
     d, inputs           numbers of position coordinates and of inputs
-    root (F, F)         inverse of the lower Cholesky factor of the features' second moment
+    across (F, F)       transposed root: the inverse of the lower Cholesky factor of the features' second moment
     weight              how much the sets grow with the leverage
 
 `tests/safety/kernel_twins.py` has each function in plain NumPy.
@@ -138,59 +138,47 @@ def _write(
                 slope[at + 1, c] += east * dpose[0, c]
 
 
-@compiled(f"f8[:,::1]({PREDICTOR}, f8[::1])")
-def rollout(predictor: Predictor, z: Array) -> Array:
-    """Return the outputs (N, n + D·d) after each period, in the frame of the start, for a window z (r + m + N·m,).
+@compiled("f8(f8[:,::1], f8[::1], f8[::1])")
+def _leverage(across: Array, total: Array, along: Array) -> float:
+    """Return |root total|² for sums of features `total` (F,). along (F,): room for the product."""
+    along[:], square = 0.0, 0.0
+    for j in range(len(total)):
+        column, sums = across[j, j:], along[j:]
+        for i in range(len(column)):
+            sums[i] += column[i] * total[j]
+    for i in range(len(along)):
+        square += along[i] * along[i]
+    return square
 
-    The outputs are the displacement, the change of heading and the other coordinates, as in `Windows.y`, then the
-    displacements of the discs at `arms`.
+
+@compiled(f"Tuple((f8[:,::1], f8[::1]))({PREDICTOR}, f8[:,::1], f8, f8[::1])")
+def rollout(predictor: Predictor, across: Array, weight: float, z: Array) -> tuple[Array, Array]:
+    """Return the outputs after each period, in the frame of the start, and the factors on the sets around them.
+
+    The outputs (N, n + D·d) are the displacement, the change of heading and the other coordinates, as in `Windows.y`,
+    then the displacements of the discs at `arms`. The factors (N,) are sqrt(1 + weight h_k), where
+    h_k = |root Σ_{j<k} φ_j|² / k is the leverage of the first k periods (docs/method.md §14).
+
+    Args:
+        z (r + m + N·m,): the window.
     """
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
-    n, r = len(C), len(others)
+    n, r, F = len(C), len(others), len(terms)
     N = (len(z) - r) // inputs - 1
-    outputs, v, y = np.zeros((N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
-    p, total = np.empty(1 + len(v) + len(saturations)), np.zeros(len(terms))
+    outputs, factors, v, y = np.zeros((N, n + len(arms) * d)), np.empty(N), np.empty(r + 2 * inputs), np.empty(n)
+    p, total, along = np.empty(1 + len(v) + len(saturations)), np.zeros(F), np.empty(F)
     pose, flat = np.zeros(1 + d), np.empty((outputs.shape[1], 0))  # no gradient
     v[:r] = z[:r]
     for k in range(N):
         now = r + (k + 1) * inputs
         v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
         _predict(C, scale, saturations, terms, v, p, total, y)
+        factors[k] = math.sqrt(1.0 + weight * (_leverage(across, total, along) / (k + 1)))
         _move(y, flat[:n], pose, flat[: 1 + d], heading)
         _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, outputs[k], flat)
         for i in range(r):
             v[i] = y[others[i]]
-    return outputs
-
-
-@compiled(f"f8[::1]({PREDICTOR}, f8[:,::1], f8, f8[::1])")
-def stretch(predictor: Predictor, root: Array, weight: float, z: Array) -> Array:
-    """Return the factors sqrt(1 + weight h_k) (N,) on the sets of a window z (r + m + N·m,).
-
-    h_k = |root Σ_{j<k} φ_j|² / k is the leverage of the first k periods (docs/method.md §14).
-    """
-    C, scale, saturations, terms, others, _, _, _, inputs = predictor
-    r, F = len(others), len(terms)
-    N = (len(z) - r) // inputs - 1
-    factors, v, y = np.empty(N), np.empty(r + 2 * inputs), np.empty(len(C))
-    p, total, along = np.empty(1 + len(v) + len(saturations)), np.zeros(F), np.empty(F)
-    across = root.T.copy()  # so that the inner loop runs along memory, and is vectorized
-    v[:r] = z[:r]
-    for k in range(N):
-        now = r + (k + 1) * inputs
-        v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
-        _predict(C, scale, saturations, terms, v, p, total, y)
-        along[:], square = 0.0, 0.0
-        for j in range(F):
-            column, sums = across[j, j:], along[j:]
-            for i in range(len(column)):
-                sums[i] += column[i] * total[j]
-        for i in range(F):
-            square += along[i] * along[i]
-        factors[k] = math.sqrt(1.0 + weight * (square / (k + 1)))
-        for i in range(r):
-            v[i] = y[others[i]]
-    return factors
+    return outputs, factors
 
 
 @compiled(f"Tuple((f8[:,::1], f8[:,:,::1]))({PREDICTOR}, f8[::1], f8[:,::1])")
@@ -255,7 +243,7 @@ def affine(predictor: Predictor, z: Array, T: Array, further: Index) -> tuple[Ar
 )
 def sets_around(
     predictor: Predictor,
-    root: Array,
+    across: Array,
     weight: float,
     T: Array,
     further: Index,
@@ -276,7 +264,7 @@ def sets_around(
     for i in range(len(T)):
         for j in range(len(z)):
             window[i] += T[i, j] * z[j]
-    outputs, wider = rollout(predictor, window), stretch(predictor, root, weight, window)
+    outputs, wider = rollout(predictor, across, weight, window)
     (N, d, _), k = directions.shape, len(further)
     centers, wide, more, more_wide = (
         np.empty((N, d)),

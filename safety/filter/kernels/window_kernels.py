@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from brakeline.compilation import compiled
-from brakeline.safety.filter.kernels.rollout_kernels import PREDICTOR, Array, Index, rollout, stretch
+from brakeline.safety.filter.kernels.rollout_kernels import PREDICTOR, Array, Index, rollout
 from brakeline.safety.model.one_step import Predictor
 
 
@@ -17,7 +17,7 @@ from brakeline.safety.model.one_step import Predictor
 )
 def score(
     predictor: Predictor,
-    root: Array,
+    across: Array,
     weight: float,
     states: Array,
     executed: Array,
@@ -42,7 +42,7 @@ def score(
     for i in range(r):
         window[i] = states[0, others[i]]
     window[r:] = executed.ravel()
-    predicted, wider = rollout(predictor, window), stretch(predictor, root, weight, window)
+    predicted, wider = rollout(predictor, across, weight, window)
     atoms, first, largest, of_scored = np.zeros(len(W)), states[0], 0.0, 0.0
     for i in range(len(W)):
         for j in range(len(window)):

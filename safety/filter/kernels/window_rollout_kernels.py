@@ -83,7 +83,7 @@ def rollouts(predictor: Predictor, z: Array) -> Array:
 
 @compiled(f"f8[:,::1]({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
 def stretches(predictor: Predictor, root: Array, weight: float, z: Array) -> Array:
-    """Return the factors (T, N) on the sets of windows z (T, r + m + N·m): see `rollout_kernels.stretch`."""
+    """Return the factors (T, N) on the sets of windows z (T, r + m + N·m): see `rollout_kernels.rollout`."""
     C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, P = len(others), len(others) + 2 * inputs + len(saturations)
     N = (z.shape[1] - r) // inputs - 1
