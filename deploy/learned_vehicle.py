@@ -87,15 +87,14 @@ class LearnedMotion:
         start[:, self._measured] = np.clip(start[:, self._measured], self._least, self._most)
         stops = inputs[:, None] * robot.stop_profile()[None, : robot.horizon]
         window = np.hstack([start[:, self._measured], inputs, stops.reshape(TRIALS, -1)])
-        expected = self._predictor.rollouts(robot, window)[..., :d]
+        expected, stretches = self._predictor.rollouts_with_stretch(robot, window)
         state, before, used = start, inputs, np.zeros(TRIALS)
-        stretches = self._predictor.stretches(robot, window)
         for i, step in enumerate(self.model.steps):
             errors = self.errors(rng, TRIED_ERROR, TRIALS)
             state, _ = self.after_one_period(state, before, stops[:, i], errors)
             before = stops[:, i]
             most = step.half_widths(window)[:, :d] * stretches[:, i : i + 1]
-            off = np.einsum("tji,tj->ti", self.turns(start), state[:, :d] - start[:, :d]) - expected[:, i]
+            off = np.einsum("tji,tj->ti", self.turns(start), state[:, :d] - start[:, :d]) - expected[:, i, :d]
             used = np.maximum(used, (np.abs(off) / most).max(axis=1))
         return float(np.quantile(used, 0.99))
 

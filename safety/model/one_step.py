@@ -150,16 +150,18 @@ class OneStep:
 
     def rollouts(self, robot: Robot, z: Array) -> Array:
         """Return the outputs (T, N, n + d·discs) for windows z (T, r + m + N·m), as `predicted_outputs` has them."""
-        from brakeline.safety.filter.kernels import window_rollout_kernels
-
-        return window_rollout_kernels.rollouts(self.arguments(robot), np.ascontiguousarray(z))
+        return replace(self, weight=0.0).rollouts_with_stretch(robot, z)[0]
 
     def stretches(self, robot: Robot, z: Array) -> Array:
         """Return the factors sqrt(1 + weight · leverage) on the sets (T, N) of windows z (T, r + m + N·m)."""
+        return self.rollouts_with_stretch(robot, z)[1]
+
+    def rollouts_with_stretch(self, robot: Robot, z: Array) -> tuple[Array, Array]:
+        """Return what `rollouts` and `stretches` return, in less time than both."""
         from brakeline.safety.filter.kernels import window_rollout_kernels
 
         whole = np.ascontiguousarray
-        return window_rollout_kernels.stretches(self.arguments(robot), whole(self.root), self.weight, whole(z))
+        return window_rollout_kernels.rollouts(self.arguments(robot), whole(self.root), self.weight, whole(z))
 
     def leverages(self, robot: Robot, z: Array) -> Array:
         """Return the leverages (T, N) of windows z (T, r + m + N·m), with which the sets grow."""

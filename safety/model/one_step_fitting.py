@@ -182,7 +182,8 @@ def fit_one_step(
     joint_space = not robot.position_dim  # the limited coordinates are scored with the plan
     factors = SetFactors.of(scores, others, kinds, model_config.outside, same=joint_space)
     one_step = replace(regression.fit(chosen, weight=choice.weight), start=factors.start)
-    errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
+    predicted, stretch = one_step.rollouts_with_stretch(robot, s.z)
+    errors = (s.after - predicted) / stretch[..., None]
     least = least_half_widths(robot, s.after)
     shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.level, least)
     n, N = s.after.shape[2], robot.horizon
@@ -279,7 +280,8 @@ def _shares_used(robot: Robot, s: Samples, regression: Regression, choice: Choic
         progress(CHOSEN + (SCORED - CHOSEN) * i / len(regression.folds))
         held = s.fold == i
         one_step = regression.fit(choice.candidate, i, choice.weight)
-        errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
+        predicted, stretch = one_step.rollouts_with_stretch(robot, s.z)
+        errors = (s.after - predicted) / stretch[..., None]
         z, chords, rest = s.z[~held], s.chords[~held], errors[~held]
         shape = shape_with_chords(robot, z, rest, chords, choice.full, choice.level, least)
         used[held] = window_shares(errors[held], s.chords[held], shape.widths(spread_features(robot, s.z[held])))

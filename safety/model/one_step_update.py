@@ -177,8 +177,8 @@ def _shares_used(robot: Robot, s: Samples, correction: Correction, choice: tuple
     for i in range(len(correction.gram)):
         held, one_step = s.fold == i, correction.fit(*choice, without=i)
         with np.errstate(invalid="ignore"):  # a rollout may diverge: `shares` takes NaN for infinity
-            errors = s.after[held] - one_step.rollouts(robot, s.z[held])
-            errors /= one_step.stretches(robot, s.z[held])[..., None]
+            predicted, stretch = one_step.rollouts_with_stretch(robot, s.z[held])
+            errors = (s.after[held] - predicted) / stretch[..., None]
         used[held] = window_shares(errors, s.chords[held], widths[held])
     return used
 

@@ -175,7 +175,8 @@ def regressors_of_braking(z_0, braking, action):
 
 def rollout(predictor, across, weight, window):
     """`rollout_kernels.rollout`."""
-    return rollouts(predictor, window[None])[0], stretches(predictor, across.T, weight, window[None])[0]
+    outputs, factors = rollouts(predictor, across.T, weight, window[None])
+    return outputs[0], factors[0]
 
 
 def turning(angle, d):
@@ -197,8 +198,8 @@ def features(predictor, window):
         speeds = (C @ phi)[others]
 
 
-def rollouts(predictor, z):
-    """`window_rollout_kernels.rollouts`."""
+def outputs_of(predictor, z):
+    """Return the outputs (T, N, n + D·d) of windows z (T, r + m + N·m)."""
     C, _, _, _, _, heading, arms, d, _ = predictor
     outputs = []
     for window in z:
@@ -215,24 +216,24 @@ def rollouts(predictor, z):
     return np.array(outputs)
 
 
-def stretches(predictor, root, weight, z):
-    """`window_rollout_kernels.stretches`."""
+def rollouts(predictor, root, weight, z):
+    """`window_rollout_kernels.rollouts`."""
     sums = np.array([np.cumsum(list(features(predictor, window)), axis=0) for window in z])  # (T, N, terms)
     spread = ((sums @ np.tril(root).T) ** 2).sum(axis=2)
-    return np.sqrt(1.0 + weight * spread / np.arange(1, sums.shape[1] + 1))
+    return outputs_of(predictor, z), np.sqrt(1.0 + weight * spread / np.arange(1, sums.shape[1] + 1))
 
 
 def linearized(predictor, z, T):
     """`rollout_kernels.linearized`: the gradient by central differences."""
     step = 1e-6
-    ends = [rollouts(predictor, ((z + sign * step * np.eye(len(z))) @ T.T)) for sign in (1.0, -1.0)]
+    ends = [outputs_of(predictor, z + sign * step * T.T) for sign in (1.0, -1.0)]
     gradient = (ends[0] - ends[1]) / (2.0 * step)
-    return rollouts(predictor, (T @ z)[None])[0], np.moveaxis(gradient, 0, -1)
+    return outputs_of(predictor, z[None])[0], np.moveaxis(gradient, 0, -1)
 
 
 def affine(predictor, z, T, kept):
     """`rollout_kernels.affine`."""
-    outputs, gradient = linearized(predictor, z, T)
+    outputs, gradient = linearized(predictor, T @ z, T)
     offset, d = outputs - gradient @ z, predictor[7]
     return gradient[:, :d], offset[:, :d], gradient[:, kept], offset[:, kept]
 

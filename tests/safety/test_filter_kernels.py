@@ -132,8 +132,7 @@ def cases(rng, d):
         "extent": (*tube, z, 0.105),
         "next_state": (*step, z, rng.normal(size=9), widening, start, turn),
         "rollout": (predictor, root.T, weight, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
-        "rollouts": (predictor, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
-        "stretches": (predictor, root, weight, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
+        "rollouts": (predictor, root, weight, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
         "affine": (predictor, *plan, np.array([d + 1, d])),
         "sets_around": (
             *(predictor, root.T, weight, plan[1], np.array([d + 1, d]), directions),
@@ -144,7 +143,7 @@ def cases(rng, d):
             *(rng.normal(size=(Q, 2 + 2 + 2 * N)), rng.random((N, d + 3, Q))),
             *(rng.random((N, d + 3, 2 + 2 + 2 * N)), rng.random((N, d + 3)), np.arange(d)),
         ),
-        "linearized": (predictor, *plan),
+        "linearized": (predictor, plan[1] @ plan[0], plan[1]),
         "distances": (*near.parts, start),
         "plausible": (*impaired(rng, near),),
         "parted": (rng.choice([0.1, 0.5, 0.7, np.nan], 6), 0.6, 0.3),

@@ -84,20 +84,18 @@ class RolloutBatch:
 
     def path(self, z: Array) -> PathBatch:
         """Roll out the plans with regressors z (nz, B)."""
-        rows, stretch = self.windows(self._T @ z)
-        xp = self._xp
-        outputs = xp.stack([xp.stack([row[i] for i in self._written]) for row in rows])
-        return PathBatch(outputs, stretch, xp.stack(rows[0][: self._n]))
+        outputs, stretch = self.windows(self._T @ z)
+        return PathBatch(outputs[:, self._written], stretch, outputs[0, : self._n])
 
-    def windows(self, window: Array) -> tuple[list[list[Array]], Array]:
-        """Roll out windows (r + m + N·m, B) of inputs; return each period's outputs (B,), and the factors (N, B)."""
+    def windows(self, window: Array) -> tuple[Array, Array]:
+        """Roll out windows (r + m + N·m, B) of inputs; return the outputs (N, n + D·d, B), and the factors (N, B)."""
         xp, total, rows, stretch = self._xp, 0.0, [], []
         for k, features, _, _, row in self._periods(window):
             total = total + features
             along = self._root @ total
             stretch.append(xp.sqrt(1.0 + self._weight * (xp.sum(along * along, axis=0) / (k + 1))))
-            rows.append(row)
-        return rows, xp.stack(stretch)
+            rows.append(xp.stack(row))
+        return xp.stack(rows), xp.stack(stretch)
 
     def _periods(self, window: Array) -> Any:
         """Yield, for each period: its index, the features, the primitives, the outputs y (n, B), and a row of outputs.

@@ -40,8 +40,8 @@ class ScoreBatch:
         N, first = states.shape[0], states[0]
         speeds = xp.stack([first[i] for i in self._regressor])
         window = xp.concat([speeds, xp.reshape(inputs, (-1, inputs.shape[2]))])
-        rows, stretch = self._rollout.windows(window)
-        predicted = xp.stack([xp.stack(row[:n]) for row in rows])  # (N, n, B)
+        outputs, stretch = self._rollout.windows(window)
+        predicted = outputs[:, :n]
         after = xp.concat([states[1:], state[None]])
         moved = [after[:, i] - first[i] if i < d else after[:, i] for i in range(n)]
         if self._heading is not None:

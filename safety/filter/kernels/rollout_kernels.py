@@ -138,17 +138,24 @@ def _write(
                 slope[at + 1, c] += east * dpose[0, c]
 
 
-@compiled("f8(f8[:,::1], f8[::1], f8[::1])")
-def _leverage(across: Array, total: Array, along: Array) -> float:
-    """Return |root total|² for sums of features `total` (F,). along (F,): room for the product."""
-    along[:], square = 0.0, 0.0
-    for j in range(len(total)):
-        column, sums = across[j, j:], along[j:]
-        for i in range(len(column)):
-            sums[i] += column[i] * total[j]
-    for i in range(len(along)):
-        square += along[i] * along[i]
-    return square
+@compiled("f8[::1](f8[:,::1], f8[:,::1])")
+def _squares(across: Array, totals: Array) -> Array:
+    """Return |root total|² (N,) for sums of features `totals` (N, F).
+
+    The loop over the periods is not the outer one, so that each column of the root is read once from memory.
+    """
+    N, F = totals.shape
+    along, squares = np.zeros((N, F)), np.zeros(N)
+    for j in range(F):
+        column = across[j, j:]
+        for k in range(N):
+            sums = along[k, j:]
+            for i in range(len(column)):
+                sums[i] += column[i] * totals[k, j]
+    for k in range(N):
+        for i in range(F):
+            squares[k] += along[k, i] * along[k, i]
+    return squares
 
 
 @compiled(f"Tuple((f8[:,::1], f8[::1]))({PREDICTOR}, f8[:,::1], f8, f8[::1])")
@@ -165,42 +172,49 @@ def rollout(predictor: Predictor, across: Array, weight: float, z: Array) -> tup
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r, F = len(C), len(others), len(terms)
     N = (len(z) - r) // inputs - 1
-    outputs, factors, v, y = np.zeros((N, n + len(arms) * d)), np.empty(N), np.empty(r + 2 * inputs), np.empty(n)
-    p, total, along = np.empty(1 + len(v) + len(saturations)), np.zeros(F), np.empty(F)
+    outputs, v, y = np.zeros((N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
+    p, total, totals = np.empty(1 + len(v) + len(saturations)), np.zeros(F), np.empty((N, F))
     pose, flat = np.zeros(1 + d), np.empty((outputs.shape[1], 0))  # no gradient
     v[:r] = z[:r]
     for k in range(N):
         now = r + (k + 1) * inputs
         v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
         _predict(C, scale, saturations, terms, v, p, total, y)
-        factors[k] = math.sqrt(1.0 + weight * (_leverage(across, total, along) / (k + 1)))
+        totals[k] = total
         _move(y, flat[:n], pose, flat[: 1 + d], heading)
         _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, outputs[k], flat)
         for i in range(r):
             v[i] = y[others[i]]
-    return outputs, factors
+    return outputs, np.sqrt(1.0 + weight * (_squares(across, totals) / np.arange(1, N + 1)))
+
+
+@compiled("f8[::1](f8[:,::1], f8[::1])")
+def _product_with(T: Array, z: Array) -> Array:
+    """Return T z, summed in the order of the columns."""
+    window = np.zeros(len(T))
+    for i in range(len(T)):
+        for j in range(len(z)):
+            window[i] += T[i, j] * z[j]
+    return window
 
 
 @compiled(f"Tuple((f8[:,::1], f8[:,:,::1]))({PREDICTOR}, f8[::1], f8[:,::1])")
 def linearized(predictor: Predictor, z: Array, T: Array) -> tuple[Array, Array]:
-    """Return the outputs (N, n + D·d) for the regressors T z, and their gradient (N, n + D·d, nz) in z (nz,).
+    """Return the outputs (N, n + D·d) of a window z (r + m + N·m,), and their gradient (N, n + D·d, c).
 
-    T (r + m + N·m, nz): the map from z to the regressors of a window, which hold all inputs.
+    T (r + m + N·m, c): how the window changes with the c numbers for which the gradient is wanted.
     """
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
-    n, r, nz = len(C), len(others), len(z)
-    N, V = (len(T) - r) // inputs - 1, r + 2 * inputs
+    n, r, nz = len(C), len(others), T.shape[1]
+    N, V = (len(z) - r) // inputs - 1, r + 2 * inputs
     outputs, gradient = np.zeros((N, n + len(arms) * d)), np.zeros((N, n + len(arms) * d, nz))
     v, y, p, total = np.empty(V), np.empty(n), np.empty(1 + V + len(saturations)), np.zeros(len(terms))
-    known, partial = np.zeros(len(T)), np.empty((n, V))
-    dv, dy, pose, dpose = np.zeros((V, nz)), np.empty((n, nz)), np.zeros(1 + d), np.zeros((1 + d, nz))
-    for i in range(len(T)):
-        for j in range(nz):
-            known[i] += T[i, j] * z[j]
-    v[:r], dv[:r] = known[:r], T[:r]
+    partial, dv, dy = np.empty((n, V)), np.zeros((V, nz)), np.empty((n, nz))
+    pose, dpose = np.zeros(1 + d), np.zeros((1 + d, nz))
+    v[:r], dv[:r] = z[:r], T[:r]
     for k in range(N):
         now = r + (k + 1) * inputs
-        v[r : r + inputs], v[r + inputs :] = known[now : now + inputs], known[now - inputs : now]
+        v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
         dv[r : r + inputs], dv[r + inputs :] = T[now : now + inputs], T[now - inputs : now]
         _predict(C, scale, saturations, terms, v, p, total, y)
         _partials(C, scale, saturations, terms, p, partial)
@@ -216,10 +230,12 @@ def linearized(predictor: Predictor, z: Array, T: Array) -> tuple[Array, Array]:
 def affine(predictor: Predictor, z: Array, T: Array, further: Index) -> tuple[Array, Array, Array, Array]:
     """Return the rollout as affine maps of z that are exact at z, for the positions and the coordinates `further` (k,).
 
+    T (r + m + N·m, nz): the map from z to a window, which holds all inputs.
+
     Returns:
         Gradient (N, d, nz) and offset (N, d) of the positions, and the same of the further coordinates.
     """
-    outputs, gradient = linearized(predictor, z, T)
+    outputs, gradient = linearized(predictor, _product_with(T, z), T)
     N, nz, k, d = len(outputs), len(z), len(further), predictor[7]
     position, offset = np.empty((N, d, nz)), np.empty((N, d))
     more, more_offset = np.empty((N, k, nz)), np.empty((N, k))
@@ -260,11 +276,7 @@ def sets_around(
         Positions (N, d) and their generators (N, d, L), the same of the further coordinates, all coordinates after one
         period (n,), and the factors (N,) that the generators hold.
     """
-    window = np.zeros(len(T))
-    for i in range(len(T)):
-        for j in range(len(z)):
-            window[i] += T[i, j] * z[j]
-    outputs, wider = rollout(predictor, across, weight, window)
+    outputs, wider = rollout(predictor, across, weight, _product_with(T, z))
     (N, d, _), k = directions.shape, len(further)
     centers, wide, more, more_wide = (
         np.empty((N, d)),

@@ -54,13 +54,27 @@ def _copy_columns(window: Array, first: int, v: Array) -> None:
             v[i, t] = window[t, first + i]
 
 
-@compiled(f"f8[:,:,::1]({PREDICTOR}, f8[:,::1])")
-def rollouts(predictor: Predictor, z: Array) -> Array:
-    """Return the outputs (T, N, n + D·d) of windows z (T, r + m + N·m): see `rollout_kernels.rollout`."""
+@compiled("void(f8[:,::1], f8[:,::1], f8, f8[:,::1], i8)")
+def _write_factors(root: Array, total: Array, weight: float, factors: Array, k: int) -> None:
+    """Write the factors on the sets after period k into column k of factors (B, N), from sums of features (F, B)."""
+    along = np.dot(root, total)
+    for t in range(len(factors)):
+        square = 0.0
+        for i in range(len(along)):
+            square += along[i, t] * along[i, t]
+        factors[t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
+
+
+@compiled(f"Tuple((f8[:,:,::1], f8[:,::1]))({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
+def rollouts(predictor: Predictor, root: Array, weight: float, z: Array) -> tuple[Array, Array]:
+    """Return outputs (T, N, n + D·d) and factors (T, N) of windows z (T, r + m + N·m): see `rollout_kernels.rollout`.
+
+    root (F, F): not transposed. With a weight of 0 all factors are 1, and cost nothing.
+    """
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r, P = len(C), len(others), len(others) + 2 * inputs + len(saturations)
     N = (z.shape[1] - r) // inputs - 1
-    outputs, one = np.zeros((len(z), N, n + len(arms) * d)), np.empty(n)
+    outputs, factors, one = np.zeros((len(z), N, n + len(arms) * d)), np.ones((len(z), N)), np.empty(n)
     flat = np.empty((outputs.shape[2], 0))  # no gradient
     for begin in range(0, len(z), BLOCK):
         window = z[begin : begin + BLOCK]
@@ -72,38 +86,12 @@ def rollouts(predictor: Predictor, z: Array) -> Array:
             _copy_columns(window, r + (k + 1) * inputs, v[r : r + inputs])
             _copy_columns(window, r + k * inputs, v[r + inputs :])
             _predict(C, scale, saturations, terms, v, p, total, y)
+            if weight != 0.0:
+                _write_factors(root, total, weight, factors[begin : begin + B], k)
             for t in range(B):
                 one[:] = y[:, t]
                 _move(one, flat[:n], pose[t], flat[: 1 + d], heading)
                 _write(one, flat[:n], pose[t], flat[: 1 + d], others, heading, arms, outputs[begin + t, k], flat)
             for i in range(r):
                 v[i] = y[others[i]]
-    return outputs
-
-
-@compiled(f"f8[:,::1]({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
-def stretches(predictor: Predictor, root: Array, weight: float, z: Array) -> Array:
-    """Return the factors (T, N) on the sets of windows z (T, r + m + N·m): see `rollout_kernels.rollout`."""
-    C, scale, saturations, terms, others, _, _, _, inputs = predictor
-    r, P = len(others), len(others) + 2 * inputs + len(saturations)
-    N = (z.shape[1] - r) // inputs - 1
-    factors = np.empty((len(z), N))
-    for begin in range(0, len(z), BLOCK):
-        window = z[begin : begin + BLOCK]
-        B = len(window)
-        v, y, p = np.empty((r + 2 * inputs, B)), np.empty((len(C), B)), np.empty((1 + P, B))
-        total = np.zeros((len(terms), B))
-        _copy_columns(window, 0, v[:r])
-        for k in range(N):
-            _copy_columns(window, r + (k + 1) * inputs, v[r : r + inputs])
-            _copy_columns(window, r + k * inputs, v[r + inputs :])
-            _predict(C, scale, saturations, terms, v, p, total, y)
-            along = np.dot(root, total)
-            for t in range(B):
-                square = 0.0
-                for i in range(len(along)):
-                    square += along[i, t] * along[i, t]
-                factors[begin + t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
-            for i in range(r):
-                v[i] = y[others[i]]
-    return factors
+    return outputs, factors
