@@ -29,14 +29,18 @@ from typing import Any
 from benchmarks.timing import Figures
 from brakeline.learner.checkpoint import CHECKPOINT, latest
 from brakeline.logs.figure_tables import analyse
-from brakeline.logs.reader import open_log
+from brakeline.logs.reader import Record, open_log
 from brakeline.logs.segment import being_written
-from tests.faults.chaos import CUT, PATIENCE, ROBOTS, Chaos, Judged, Stuck
 from tests.faults.five_hosts import CLOCKS, TURN, Fleet
 from tests.faults.network_hosts import Hosts
 from tests.faults.small_volume import SmallVolume
 from tests.fuzz.mutations import flipped
 
+ROBOTS = ("ground", "quadrotor")
+CUT = (0.3, 6.0)  # s that a fault lasts
+PROGRESS = 20  # steps of each robot between two groups of faults
+PATIENCE = 240.0  # s until all goes on after a group
+LAST = 300  # steps more, at the end
 LEG = 100  # faults
 MOST_AT_ONCE = 12
 STAGGER = 0.5  # s, the longest time between two faults of a group
@@ -44,6 +48,10 @@ FARTHEST = 10.0  # h that a host's clock may be off: certificates are valid from
 VOLUME = 192  # MiB for each log and each learner
 STARTED = ("resumed at step", " ready")  # log lines of a process that accepted what it read
 KINDS = ("kill", "stop", "full disk", "clock jump", "lost link", "damaged file")
+
+
+class Stuck(RuntimeError):
+    """After a fault the run did not go on; the message names the missing processes."""
 
 
 @dataclass
@@ -61,9 +69,25 @@ class Leg:
     fleet: Fleet
     random: Random
     volumes: dict[str, SmallVolume]
-    chaos: Chaos
     counts: Counter[str] = field(default_factory=Counter)
     damages: list[Damage] = field(default_factory=list)
+    recovery: list[float] = field(default_factory=list)  # s from each group of faults until all went on
+
+    def settle(self) -> None:
+        """Wait until every process lives and each robot has taken some more steps. Raises Stuck."""
+        began = time.monotonic()
+        before = {robot: self.fleet.taken(robot) for robot in ROBOTS}
+        missing: set[str] = set()
+        while time.monotonic() - began < PATIENCE:
+            self.fleet.keep()
+            missing = set(self.fleet.spots) - self.fleet.living()
+            on = all(self.fleet.taken(robot) - before[robot] >= PROGRESS for robot in ROBOTS)
+            if not missing and on:
+                self.recovery.append(time.monotonic() - began)
+                return
+            time.sleep(TURN)
+        taken = {robot: self.fleet.taken(robot) - before[robot] for robot in ROBOTS}
+        raise Stuck(f"not within {PATIENCE:.0f} s: missing {sorted(missing)}, steps since then {taken}")
 
     def group(self, most: int) -> str:
         """Make some faults at a time, undo them, and return their descriptions."""
@@ -79,6 +103,25 @@ class Leg:
         for timer in timers:
             timer.join()
         return ", ".join(said)
+
+    def finish(self) -> None:
+        """Let the learners reach their last step and end by themselves."""
+        for robot in ROBOTS:
+            name = f"learner-{robot}"
+            self.fleet.kill(name, signal.SIGTERM)  # with a checkpoint
+            spot = self.fleet.spots[name]
+            words = list(spot.words)
+            words[words.index("--steps") + 1] = str(self.fleet.learned(robot) + LAST)
+            spot.words = tuple(words)
+            self.fleet.launch(name)
+        deadline = time.monotonic() + PATIENCE
+        while not all(self.fleet.spots[f"learner-{robot}"].done for robot in ROBOTS):
+            if time.monotonic() > deadline:
+                raise Stuck("the learners did not finish")
+            self.fleet.keep()
+            time.sleep(TURN)
+        time.sleep(1.0)  # for the last messages
+        self.fleet.end()
 
     def _kill(self) -> tuple[str, float, Callable[[], None]]:
         name = self.random.choice(list(self.fleet.spots))
@@ -190,6 +233,36 @@ def _is_named(path: Path) -> bool:
     return bool(log.cuts or log.malformed)
 
 
+@dataclass
+class Judged:
+    """Both recorders' logs, read after the end."""
+
+    steps: int = 0  # in either log
+    twice: int = 0  # in one log
+    collisions: int = 0
+
+    def read(self, fleet: Fleet) -> None:
+        seen: dict[tuple[str, int], set[int]] = defaultdict(set)
+        for recorder in range(fleet.recorders):
+            mine: dict[tuple[str, int], set[int]] = defaultdict(set)
+            for record in open_log(fleet.log(recorder)):
+                if record.topic == "step":
+                    self._take(record, mine, seen)
+        self.steps = sum(map(len, seen.values()))
+
+    def _take(
+        self, record: Record, mine: dict[tuple[str, int], set[int]], seen: dict[tuple[str, int], set[int]]
+    ) -> None:
+        header = record.message.header
+        name = record.key, header.run
+        if header.sequence in mine[name]:
+            self.twice += 1
+        elif header.sequence not in seen[name]:
+            self.collisions += record.message.collision
+        mine[name].add(header.sequence)
+        seen[name].add(header.sequence)
+
+
 def wrong_figures(fleet: Fleet, elapsed: float) -> list[str]:
     """Compare the figures of each recorder's log with its messages. Returns what is wrong."""
     wrong = []
@@ -242,15 +315,15 @@ def leg(seed: str, faults: int, evidence: Path) -> dict[str, Any]:
         fleet = stack.enter_context(Fleet(folder, hosts, ROBOTS, seed=random.randrange(10**6)))
         stack.callback(hosts.close)  # before the volumes go
         fleet.start()
-        run = Leg(fleet, random, volumes, Chaos(fleet, random))
+        run = Leg(fleet, random, volumes)
         stuck = ""
         try:
-            run.chaos.settle()
+            run.settle()
             while (left := faults - sum(run.counts[kind] for kind in KINDS)) > 0:
                 said = run.group(left)
-                run.chaos.settle()
-                print(f"{faults - left}: {said}: {run.chaos.recovery[-1]:.1f} s", file=sys.stderr, flush=True)
-            run.chaos.finish()
+                run.settle()
+                print(f"{faults - left}: {said}: {run.recovery[-1]:.1f} s", file=sys.stderr, flush=True)
+            run.finish()
         except Stuck as error:
             stuck = str(error)
             hosts.close()  # kills every process
@@ -267,7 +340,7 @@ def leg(seed: str, faults: int, evidence: Path) -> dict[str, Any]:
             "not named": [damage.path.name for damage in run.damages if not damage.named()],
             "wrong": wrong_figures(fleet, elapsed),
             "stuck": stuck,
-            "longest recovery": max(run.chaos.recovery, default=0.0),
+            "longest recovery": max(run.recovery, default=0.0),
             "minutes": elapsed / 60.0,
         }
         if judged.collisions or judged.twice or any(row[what] for what in ("not named", "wrong", "stuck")):
