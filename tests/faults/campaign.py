@@ -17,7 +17,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ from typing import Any
 from benchmarks.timing import Figures
 from brakeline.learner.checkpoint import CHECKPOINT, latest
 from brakeline.logs.figure_tables import analyse
-from brakeline.logs.reader import Record, open_log
+from brakeline.logs.reader import open_log
 from brakeline.logs.segment import being_written
 from tests.faults.five_hosts import CLOCKS, TURN, Fleet
 from tests.faults.network_hosts import Hosts
@@ -234,55 +234,39 @@ def _is_named(path: Path) -> bool:
 
 
 @dataclass
-class Judged:
-    """Both recorders' logs, read after the end."""
+class Recorded:
+    """The steps in the log of a recorder."""
 
-    steps: int = 0  # in either log
-    twice: int = 0  # in one log
-    collisions: int = 0
-
-    def read(self, fleet: Fleet) -> None:
-        seen: dict[tuple[str, int], set[int]] = defaultdict(set)
-        for recorder in range(fleet.recorders):
-            mine: dict[tuple[str, int], set[int]] = defaultdict(set)
-            for record in open_log(fleet.log(recorder)):
-                if record.topic == "step":
-                    self._take(record, mine, seen)
-        self.steps = sum(map(len, seen.values()))
-
-    def _take(
-        self, record: Record, mine: dict[tuple[str, int], set[int]], seen: dict[tuple[str, int], set[int]]
-    ) -> None:
-        header = record.message.header
-        name = record.key, header.run
-        if header.sequence in mine[name]:
-            self.twice += 1
-        elif header.sequence not in seen[name]:
-            self.collisions += record.message.collision
-        mine[name].add(header.sequence)
-        seen[name].add(header.sequence)
+    steps: dict[tuple[str, int, int], bool] = field(default_factory=dict)  # key, run and number: a collision or not
+    twice: int = 0
 
 
-def wrong_figures(fleet: Fleet, elapsed: float) -> list[str]:
+def recorded(log_file: Path) -> Recorded:
+    """Read a log."""
+    found = Recorded()
+    for record in open_log(log_file):
+        if record.topic == "step":
+            header = record.message.header
+            step = record.key, header.run, header.sequence
+            found.twice += step in found.steps
+            found.steps.setdefault(step, record.message.collision)
+    return found
+
+
+def wrong_figures(fleet: Fleet, logs: list[Recorded], elapsed: float) -> list[str]:
     """Compare the figures of each recorder's log with its messages. Returns what is wrong."""
     wrong = []
-    for recorder in range(fleet.recorders):
+    for recorder, log in enumerate(logs):
         figures = analyse(fleet.log(recorder))
-        streams: dict[tuple[str, int], set[int]] = defaultdict(set)
-        collisions = 0
-        for record in open_log(fleet.log(recorder)):
-            if record.topic == "step":
-                header = record.message.header
-                if header.sequence not in streams[record.key, header.run]:
-                    collisions += record.message.collision
-                streams[record.key, header.run].add(header.sequence)
-        steps = sum(map(len, streams.values()))
-        lost = sum(max(numbers) - len(numbers) for numbers in streams.values())
+        last: dict[tuple[str, int], int] = {}
+        for key, run, number in log.steps:
+            last[key, run] = max(last.get((key, run), 0), number)
+        lost = sum(last.values()) - len(log.steps)
         counted = sum(topic["missing"] for key, topic in figures["topics"].items() if key.startswith("step/"))
         for name, said, true in (
-            ("steps", figures["steps"] + figures["refused"], steps),
+            ("steps", figures["steps"] + figures["refused"], len(log.steps)),
             ("refused", figures["refused"], 0),
-            ("collisions", figures["collisions"], collisions),
+            ("collisions", figures["collisions"], sum(log.steps.values())),
         ):
             if said != true:
                 wrong.append(f"recorder-{recorder}: {name} {said}, not {true}")
@@ -327,23 +311,23 @@ def leg(seed: str, faults: int, evidence: Path) -> dict[str, Any]:
         except Stuck as error:
             stuck = str(error)
             hosts.close()  # kills every process
-        judged = Judged()
-        judged.read(fleet)
+        logs = [recorded(fleet.log(recorder)) for recorder in range(fleet.recorders)]
+        steps = {step: collision for log in logs for step, collision in log.steps.items()}
         elapsed = time.monotonic() - began
         row = {
             "seed": seed,
             "faults": dict(run.counts),
-            "steps": judged.steps,
-            "steps twice in a log": judged.twice,
-            "collisions": judged.collisions,
+            "steps": len(steps),
+            "steps twice in a log": sum(log.twice for log in logs),
+            "collisions": sum(steps.values()),
             "damaged": len(run.damages),
             "not named": [damage.path.name for damage in run.damages if not damage.named()],
-            "wrong": wrong_figures(fleet, elapsed),
+            "wrong": wrong_figures(fleet, logs, elapsed),
             "stuck": stuck,
             "longest recovery": max(run.recovery, default=0.0),
             "minutes": elapsed / 60.0,
         }
-        if judged.collisions or judged.twice or any(row[what] for what in ("not named", "wrong", "stuck")):
+        if any(row[what] for what in ("steps twice in a log", "collisions", "not named", "wrong", "stuck")):
             shutil.copytree(folder, evidence, ignore=shutil.ignore_patterns("keys", "data", "ballast"))
         return row
 
