@@ -38,7 +38,6 @@ from benchmarks import (
     log_reading,
     model_peers,
     perception_cost,
-    recording_cost,
     roundtrip,
     service_limit,
     set_widths,
@@ -49,7 +48,7 @@ from benchmarks import (
 )
 from benchmarks.timing import Figures, Words
 from brakeline.logs.stacking_table import StackingTable
-from tests.faults import autopilot_disturbances, campaign, chaos, crowd, link_faults, link_loss
+from tests.faults import autopilot_disturbances, campaign, crowd, link_faults, link_loss
 from tests.fuzz import message_fuzz
 
 
@@ -62,13 +61,11 @@ class Bench:
     json: bool = False
     """Print one JSON object on stdout."""
     seed: int = 0
-    """Draw the faults of chaos, fault-campaign and cuts, and the messages of fuzz, from this seed."""
+    """Draw the faults of fault-campaign and cuts, and the messages of fuzz, from this seed."""
     kills: int = 100
-    """Cause this many faults in chaos and fault-campaign."""
+    """Cause this many faults in fault-campaign."""
     faults: int = 60
     """Cause this many faults in cuts."""
-    delay: float = 0.0
-    """Delay the messages between actors and routers of chaos by this time, each way [s]."""
     messages: int = 1_000_000
     """Send this many messages in fuzz."""
     plans: int = driving_groups.PLANS
@@ -115,7 +112,6 @@ BENCHMARKS = {
     "roundtrip": Benchmark(roundtrip, lambda _: roundtrip.run()),
     "linkloss": Benchmark(link_loss, lambda _: link_loss.run()),
     "logs": Benchmark(log_reading, lambda _: log_reading.run()),
-    "recording": Benchmark(recording_cost, lambda _: recording_cost.run()),
     "askers": Benchmark(askers, lambda _: askers.run()),
     "logs-2gb": Benchmark(log_reading, lambda _: log_reading.run_large(), named=True),
     "fuzz": Benchmark(message_fuzz, lambda given: message_fuzz.fuzz(given.messages, given.seed), named=True),
@@ -141,7 +137,6 @@ BENCHMARKS = {
     "fault-campaign": Benchmark(
         campaign, lambda given: campaign.campaign(given.kills, given.seed, given.folder), named=True
     ),
-    "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }
 
 
@@ -151,7 +146,7 @@ def overview() -> str:
     for name, one in BENCHMARKS.items():
         what = (one.module.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
         lines.append(f"  {name}: {what}{' Runs only if you name it.' if one.named else ''}")
-    examples = "  python -m benchmarks decide --json\n  python -m benchmarks chaos --kills 30 --seed 1"
+    examples = "  python -m benchmarks decide --json\n  python -m benchmarks fault-campaign --kills 30 --seed 1"
     return "\n".join([Bench.__doc__ or "", "", *lines, "", "examples:", examples])
 
 

@@ -17,7 +17,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -31,12 +31,16 @@ from brakeline.learner.checkpoint import CHECKPOINT, latest
 from brakeline.logs.figure_tables import analyse
 from brakeline.logs.reader import open_log
 from brakeline.logs.segment import being_written
-from tests.faults.chaos import CUT, PATIENCE, ROBOTS, Chaos, Judged, Stuck
 from tests.faults.five_hosts import CLOCKS, TURN, Fleet
 from tests.faults.network_hosts import Hosts
 from tests.faults.small_volume import SmallVolume
 from tests.fuzz.mutations import flipped
 
+ROBOTS = ("ground", "quadrotor")
+CUT = (0.3, 6.0)  # s that a fault lasts
+PROGRESS = 20  # steps of each robot between two groups of faults
+PATIENCE = 240.0  # s until all goes on after a group
+LAST = 300  # steps more, at the end
 LEG = 100  # faults
 MOST_AT_ONCE = 12
 STAGGER = 0.5  # s, the longest time between two faults of a group
@@ -44,6 +48,10 @@ FARTHEST = 10.0  # h that a host's clock may be off: certificates are valid from
 VOLUME = 192  # MiB for each log and each learner
 STARTED = ("resumed at step", " ready")  # log lines of a process that accepted what it read
 KINDS = ("kill", "stop", "full disk", "clock jump", "lost link", "damaged file")
+
+
+class Stuck(RuntimeError):
+    """After a fault the run did not go on; the message names the missing processes."""
 
 
 @dataclass
@@ -61,9 +69,25 @@ class Leg:
     fleet: Fleet
     random: Random
     volumes: dict[str, SmallVolume]
-    chaos: Chaos
     counts: Counter[str] = field(default_factory=Counter)
     damages: list[Damage] = field(default_factory=list)
+    recovery: list[float] = field(default_factory=list)  # s from each group of faults until all went on
+
+    def settle(self) -> None:
+        """Wait until every process lives and each robot has taken some more steps. Raises Stuck."""
+        began = time.monotonic()
+        before = {robot: self.fleet.taken(robot) for robot in ROBOTS}
+        missing: set[str] = set()
+        while time.monotonic() - began < PATIENCE:
+            self.fleet.keep()
+            missing = set(self.fleet.spots) - self.fleet.living()
+            on = all(self.fleet.taken(robot) - before[robot] >= PROGRESS for robot in ROBOTS)
+            if not missing and on:
+                self.recovery.append(time.monotonic() - began)
+                return
+            time.sleep(TURN)
+        taken = {robot: self.fleet.taken(robot) - before[robot] for robot in ROBOTS}
+        raise Stuck(f"not within {PATIENCE:.0f} s: missing {sorted(missing)}, steps since then {taken}")
 
     def group(self, most: int) -> str:
         """Make some faults at a time, undo them, and return their descriptions."""
@@ -79,6 +103,25 @@ class Leg:
         for timer in timers:
             timer.join()
         return ", ".join(said)
+
+    def finish(self) -> None:
+        """Let the learners reach their last step and end by themselves."""
+        for robot in ROBOTS:
+            name = f"learner-{robot}"
+            self.fleet.kill(name, signal.SIGTERM)  # with a checkpoint
+            spot = self.fleet.spots[name]
+            words = list(spot.words)
+            words[words.index("--steps") + 1] = str(self.fleet.learned(robot) + LAST)
+            spot.words = tuple(words)
+            self.fleet.launch(name)
+        deadline = time.monotonic() + PATIENCE
+        while not all(self.fleet.spots[f"learner-{robot}"].done for robot in ROBOTS):
+            if time.monotonic() > deadline:
+                raise Stuck("the learners did not finish")
+            self.fleet.keep()
+            time.sleep(TURN)
+        time.sleep(1.0)  # for the last messages
+        self.fleet.end()
 
     def _kill(self) -> tuple[str, float, Callable[[], None]]:
         name = self.random.choice(list(self.fleet.spots))
@@ -190,26 +233,40 @@ def _is_named(path: Path) -> bool:
     return bool(log.cuts or log.malformed)
 
 
-def wrong_figures(fleet: Fleet, elapsed: float) -> list[str]:
+@dataclass
+class Recorded:
+    """The steps in the log of a recorder."""
+
+    steps: dict[tuple[str, int, int], bool] = field(default_factory=dict)  # key, run and number: a collision or not
+    twice: int = 0
+
+
+def recorded(log_file: Path) -> Recorded:
+    """Read a log."""
+    found = Recorded()
+    for record in open_log(log_file):
+        if record.topic == "step":
+            header = record.message.header
+            step = record.key, header.run, header.sequence
+            found.twice += step in found.steps
+            found.steps.setdefault(step, record.message.collision)
+    return found
+
+
+def wrong_figures(fleet: Fleet, logs: list[Recorded], elapsed: float) -> list[str]:
     """Compare the figures of each recorder's log with its messages. Returns what is wrong."""
     wrong = []
-    for recorder in range(fleet.recorders):
+    for recorder, log in enumerate(logs):
         figures = analyse(fleet.log(recorder))
-        streams: dict[tuple[str, int], set[int]] = defaultdict(set)
-        collisions = 0
-        for record in open_log(fleet.log(recorder)):
-            if record.topic == "step":
-                header = record.message.header
-                if header.sequence not in streams[record.key, header.run]:
-                    collisions += record.message.collision
-                streams[record.key, header.run].add(header.sequence)
-        steps = sum(map(len, streams.values()))
-        lost = sum(max(numbers) - len(numbers) for numbers in streams.values())
+        last: dict[tuple[str, int], int] = {}
+        for key, run, number in log.steps:
+            last[key, run] = max(last.get((key, run), 0), number)
+        lost = sum(last.values()) - len(log.steps)
         counted = sum(topic["missing"] for key, topic in figures["topics"].items() if key.startswith("step/"))
         for name, said, true in (
-            ("steps", figures["steps"] + figures["refused"], steps),
+            ("steps", figures["steps"] + figures["refused"], len(log.steps)),
             ("refused", figures["refused"], 0),
-            ("collisions", figures["collisions"], collisions),
+            ("collisions", figures["collisions"], sum(log.steps.values())),
         ):
             if said != true:
                 wrong.append(f"recorder-{recorder}: {name} {said}, not {true}")
@@ -242,35 +299,35 @@ def leg(seed: str, faults: int, evidence: Path) -> dict[str, Any]:
         fleet = stack.enter_context(Fleet(folder, hosts, ROBOTS, seed=random.randrange(10**6)))
         stack.callback(hosts.close)  # before the volumes go
         fleet.start()
-        run = Leg(fleet, random, volumes, Chaos(fleet, random))
+        run = Leg(fleet, random, volumes)
         stuck = ""
         try:
-            run.chaos.settle()
+            run.settle()
             while (left := faults - sum(run.counts[kind] for kind in KINDS)) > 0:
                 said = run.group(left)
-                run.chaos.settle()
-                print(f"{faults - left}: {said}: {run.chaos.recovery[-1]:.1f} s", file=sys.stderr, flush=True)
-            run.chaos.finish()
+                run.settle()
+                print(f"{faults - left}: {said}: {run.recovery[-1]:.1f} s", file=sys.stderr, flush=True)
+            run.finish()
         except Stuck as error:
             stuck = str(error)
             hosts.close()  # kills every process
-        judged = Judged()
-        judged.read(fleet)
+        logs = [recorded(fleet.log(recorder)) for recorder in range(fleet.recorders)]
+        steps = {step: collision for log in logs for step, collision in log.steps.items()}
         elapsed = time.monotonic() - began
         row = {
             "seed": seed,
             "faults": dict(run.counts),
-            "steps": judged.steps,
-            "steps twice in a log": judged.twice,
-            "collisions": judged.collisions,
+            "steps": len(steps),
+            "steps twice in a log": sum(log.twice for log in logs),
+            "collisions": sum(steps.values()),
             "damaged": len(run.damages),
             "not named": [damage.path.name for damage in run.damages if not damage.named()],
-            "wrong": wrong_figures(fleet, elapsed),
+            "wrong": wrong_figures(fleet, logs, elapsed),
             "stuck": stuck,
-            "longest recovery": max(run.chaos.recovery, default=0.0),
+            "longest recovery": max(run.recovery, default=0.0),
             "minutes": elapsed / 60.0,
         }
-        if judged.collisions or judged.twice or any(row[what] for what in ("not named", "wrong", "stuck")):
+        if any(row[what] for what in ("steps twice in a log", "collisions", "not named", "wrong", "stuck")):
             shutil.copytree(folder, evidence, ignore=shutil.ignore_patterns("keys", "data", "ballast"))
         return row
 

@@ -1,6 +1,5 @@
 """A run over five hosts, robots far from the rest, whose clocks are hours apart: robots that are cut off brake,
-everybody finds another router and another replica, the learner moves, and every step counts once. The long form is
-`python -m benchmarks chaos`."""
+everybody finds another router and another replica, the learner moves, and every step counts once."""
 
 from collections import Counter
 from contextlib import suppress
@@ -14,8 +13,7 @@ from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.reader import read
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from tests.faults.campaign import campaign
-from tests.faults.chaos import ROBOTS
+from tests.faults.campaign import ROBOTS, campaign
 from tests.faults.five_hosts import MOVED, Fleet
 from tests.faults.network_hosts import Hosts, NoHosts
 from tests.waiting import until

@@ -33,9 +33,13 @@ from tests.deploy.run.test_display import rows_of
 from tests.waiting import PATIENCE, until
 
 
+def launcher_in(folder: Path) -> Launcher:
+    return Launcher(RunConfig(), folder, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+
+
 @pytest.fixture
 def launcher(tmp_path: Path) -> Launcher:
-    return Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+    return launcher_in(tmp_path)
 
 
 def say(launcher: Launcher, topic: Topic, message: object) -> None:
@@ -187,7 +191,7 @@ with only_launcher(Path({str(tmp_path)!r})):
         try:
             assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
             with pytest.raises(LaunchError, match=rf"is running \(process {os.getpid()}\)"):
-                Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",))).run()
+                launcher_in(tmp_path).run()
         finally:
             holder.kill()
     with only_launcher(tmp_path):
@@ -274,7 +278,7 @@ def test_a_run_goes_on_where_no_link_can_be_made(tmp_path: Path, monkeypatch, ca
 
     (tmp_path / "run").mkdir()
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    Launcher(RunConfig(), tmp_path / "run", BusSettings(listen=("tcp/127.0.0.1:7447",)))._claim_folder()
+    launcher_in(tmp_path / "run")._claim_folder()
     assert (tmp_path / "run" / CONFIG).exists() and [path.name for path in tmp_path.iterdir()] == ["run"]
     assert f"{tmp_path}/latest does not point to this run: " in caplog.text
 
@@ -283,10 +287,7 @@ def test_two_runs_that_start_at_once_do_not_take_the_link_from_each_other(tmp_pa
     """The second found the link of the first in its place, and ended."""
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
-    launchers = [
-        Launcher(RunConfig(), tmp_path / name, BusSettings(listen=("tcp/127.0.0.1:7447",)))
-        for name in ("first", "second")
-    ]
+    launchers = [launcher_in(tmp_path / name) for name in ("first", "second")]
     link, pid = Path.symlink_to, os.getpid()
 
     def link_after_the_other(self: Path, target: str) -> None:
@@ -303,13 +304,13 @@ def test_two_runs_that_start_at_once_do_not_take_the_link_from_each_other(tmp_pa
 def test_a_run_that_is_resumed_as_the_latest_stays_the_latest(tmp_path: Path) -> None:
     (tmp_path / "first").mkdir()
     (tmp_path / "latest").symlink_to("first")
-    Launcher(RunConfig(), tmp_path / "latest", BusSettings(listen=("tcp/127.0.0.1:7447",)))._claim_folder()
+    launcher_in(tmp_path / "latest")._claim_folder()
     assert (tmp_path / "latest").readlink() == Path("first")
 
 
 def test_the_figures_say_whether_they_count_from_a_resumption_on(tmp_path: Path) -> None:
     for resumed in (False, True):
-        launcher = Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+        launcher = launcher_in(tmp_path)
         launcher._claim_folder()
         assert launcher.figures()["resumed"] is resumed
 
