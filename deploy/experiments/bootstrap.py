@@ -9,8 +9,10 @@ With few seeds the interval is rough, so the table states the number of seeds an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,8 +57,8 @@ def ratio(
     per_seed = np.array([a.sum() / b.sum() for a, b in pairs])
     if crossed and len({len(a) for a, _ in pairs}) > 1:
         raise ValueError("seeds with the same episodes have the same number of them")
-    shared = _drawn(len(pairs[0][0]), rng) if crossed else None
-    counts = [_drawn(len(a), rng) if shared is None else shared for a, _ in pairs]  # how often each episode was drawn
+    # how often each episode was drawn
+    counts = [_drawn_for_all(len(a), seed, rng) if crossed else _drawn(len(a), rng) for a, _ in pairs]
     resampled = np.stack([(drawn @ a) / (drawn @ b) for (a, b), drawn in zip(pairs, counts, strict=True)])
     shape = len(pairs), RESAMPLES  # of the seeds drawn
     # Without common episodes, draw them independently for each seed, also if a seed is drawn twice.
@@ -88,3 +90,16 @@ def rate(happened: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimat
 def _drawn(episodes: int, rng: np.random.Generator) -> Array:
     """Return how often each episode is drawn, (RESAMPLES, episodes)."""
     return np.asarray(rng.multinomial(episodes, np.full(episodes, 1.0 / episodes), size=RESAMPLES), float)
+
+
+def _drawn_for_all(episodes: int, seed: int, rng: np.random.Generator) -> Array:
+    """Return the first draw of `rng`, which was made from `seed`: a table draws the same one hundreds of times."""
+    drawn, rng.bit_generator.state = _first_draw(episodes, seed)
+    return drawn
+
+
+@lru_cache(maxsize=4)
+def _first_draw(episodes: int, seed: int) -> tuple[Array, Mapping[str, Any]]:
+    """Return the first draw from a seed, and the generator's state after it."""
+    rng = np.random.default_rng(seed)
+    return _drawn(episodes, rng), rng.bit_generator.state
