@@ -13,7 +13,7 @@ from brakeline.errors import Mismatch
 from brakeline.messaging.number_checks import check_numbers
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
-from brakeline.safety.gym_checks import age_of_acceleration, check_filter, check_robot, check_rows
+from brakeline.safety.gym_checks import age_of_acceleration, check_robot, check_rows
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -60,9 +60,11 @@ class BatchSafetyWrapper(VectorWrapper):
             raise Mismatch(
                 f"BatchSafetyWrapper steps {env.unwrapped} itself, past {env}: put it inside all other wrappers"
             )
-        check_filter(filter)
         if not hasattr(filter, "decide_batch"):
-            raise TypeError(f"a {type(filter).__name__} decides on one robot at a time: give RowByRow of it")
+            name = type(filter).__name__
+            if hasattr(filter, "observed"):  # a rival: clients have no such attribute
+                raise TypeError(f"a {name} decides on one robot at a time: give RowByRow of it")
+            raise TypeError(f"a filter is needed here, not a {name}: give Filter.load(NAME_OR_PATH)")
         super().__init__(env)
         check_robot(env, filter.robot)
         check_bound(getattr(filter, "model", None), filter.robot, accept_bound)

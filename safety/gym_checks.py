@@ -1,4 +1,4 @@
-"""Check what a Gymnasium wrapper gets: the robot of the environment, the filter of many robots, and their actions."""
+"""Check what a Gymnasium wrapper gets: the robot of the environment, the age of its accelerations, and many actions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.service.filter_client import FilterClient
 
 UNSHARED = {"accept_bound"}  # in a description: a limit for the model set, which says nothing about the robot
 
@@ -31,12 +30,6 @@ def check_robot(env: Any, robot: Robot) -> None:
         f"the environment has the robot {simulated.name}, the filter was made for {robot.name}: their {differ}. "
         "Give both the same description; `brakeline certify DESCRIPTION --use` makes the model set of a description"
     )
-
-
-def check_filter(filter: Any) -> None:
-    """Check what decides for many robots. Raises TypeError: it is no filter, or a client, which serves one robot."""
-    if isinstance(filter, FilterClient) or not hasattr(filter, "robot"):
-        raise TypeError(f"a filter is needed here, not a {type(filter).__name__}: give Filter.load(NAME_OR_PATH)")
 
 
 def age_of_acceleration(infos: Mapping[str, Any], given: float | None, otherwise: float, method: Any) -> float:

@@ -19,7 +19,7 @@ from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import diagnostics, is_measurement_fault
-from brakeline.safety.gym_checks import age_of_acceleration, check_filter, check_robot, check_rows
+from brakeline.safety.gym_checks import age_of_acceleration, check_robot, check_rows
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.filter_client import Answer, obstacle_lists
 from brakeline.safety.service.in_process import InProcess, request_observation
@@ -57,7 +57,6 @@ class VectorSafetyWrapper(VectorWrapper):
             TypeError: `filter` is a client, which has the backup plan of one robot.
         """
         super().__init__(env)
-        check_filter(filter)
         self.client, self.penalty = InProcess(filter, accept_bound), penalty
         check_robot(env.unwrapped.envs[0] if isinstance(env.unwrapped, SyncVectorEnv) else env, filter.robot)
         check_numbers(self, "penalty", least=0.0)

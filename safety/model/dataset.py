@@ -240,12 +240,8 @@ class Dataset:
         """Return a hash of the recorded numbers, 12 hexadecimal digits: the same after `save` and `load`."""
         sha = hashlib.sha256()
         for t in self.trajectories:
-            sha.update(t.states.tobytes())
-            sha.update(t.inputs.tobytes())
-            sha.update(t.paths.tobytes())
-            sha.update(t.turned.tobytes())
-            sha.update(t.first_in_force.tobytes())
-            sha.update(b"" if t.headings is None else t.headings.tobytes())
+            for part in (t.states, t.inputs, t.paths, t.turned, t.first_in_force, t.headings):
+                sha.update(b"" if part is None else part.tobytes())
         return sha.hexdigest()[:12]
 
 

@@ -19,6 +19,7 @@ from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.arena_generator import draw_arena
+from tests.laws.page_tables import table_rows
 from tests.laws.test_names import PARTS
 
 pytestmark = pytest.mark.fast
@@ -93,14 +94,13 @@ def test_the_readme_is_short() -> None:
 def test_the_pages_have_the_figures_of_the_comparison(name: str, robot: str) -> None:
     table = json.loads((ROOT / "results" / robot / "table.json").read_text())
     default, dense, training = (table["parts"][part] for part in ("default", "dense", "training"))
-    lines = (ROOT / name).read_text().splitlines()
-    head = next(k for k, line in enumerate(lines) if line.startswith(f"| {robot}, after {table['steps']:,} steps |"))
-    for line, method in zip(lines[head + 2 :], default, strict=False):
+    rows = table_rows(name, f"| {robot}, after {table['steps']:,} steps |")
+    for cells, method in zip(rows, default, strict=True):
         shares = [part[method][f"{what} rate"] for part in (default, dense) for what in ("goal", "collision")]
         collisions = training[method]["collisions"]
         figures = [f"{100 * share['value']:.1f} %" for share in shares] + [f"{collisions:.{int(0 < collisions < 1)}f}"]
         steps, periods = training[method]["steps to 90 % goals"]["value"], training[method]["pre-training samples"]
-        label, *row = (re.split(r" [*(]", cell)[0].strip() for cell in line.strip("| ").split(" | "))
+        label, *row = (re.split(r" [*(]", cell)[0] for cell in cells)
         assert label == METHODS[method].label and row == [*figures, f"{steps:,.0f}", f"{periods:,}"]
 
 
@@ -111,12 +111,8 @@ def with_interval(share: dict[str, float], digits: int) -> str:
 
 
 def rows_of_the_robots_page(robot: str) -> dict[str, list[str]]:
-    """Return the rows of the first table of a robot's page with results, by their first cell."""
-    lines = (ROOT / "docs" / f"results_{robot}.md").read_text().splitlines()
-    head = next(k for k, line in enumerate(lines) if line.startswith(f"| {robot}, after "))
-    table = lines[head : next(k for k in range(head, len(lines)) if not lines[k].startswith("|"))]
-    rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in table]
-    return {label: row for label, *row in rows}
+    """Return the rows of the table with results on a robot's page, by their first cell."""
+    return {label: row for label, *row in table_rows(f"docs/results_{robot}.md", f"| {robot}, after ", heads=True)}
 
 
 def test_the_page_of_the_ground_robot_has_the_figures_of_the_comparison() -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from brakeline.deploy.experiments.campaign import markdown
 from brakeline.logs.proportion_intervals import clopper_pearson
+from tests.laws.page_tables import table_rows
 
 pytestmark = pytest.mark.fast
 
@@ -26,17 +27,6 @@ def stored(*files: str) -> dict[tuple[str, str, str], Cell]:
     """Return the cells of campaigns by arena, policy and perturbation."""
     cells = [cell for file in files for cell in json.loads((RESULTS / f"{file}.json").read_text())["cells"]]
     return {(cell["arena"], cell["policy"], cell["perturbation"]): cell for cell in cells}
-
-
-def rows(page: str, first: str) -> list[list[str]]:
-    """Return the cells of the rows of each table whose first line begins with `first`, that line included."""
-    lines, found = (ROOT / page).read_text().splitlines(), []
-    for head, line in enumerate(lines):
-        if line.startswith(first):
-            end = next((k for k in range(head, len(lines)) if not lines[k].startswith("|")), len(lines))
-            found += [[cell.strip() for cell in row[1:-1].split("|")] for row in lines[head:end] if "---" not in row]
-    assert found, first
-    return found
 
 
 def says(text: str, values: Sequence[float]) -> bool:
@@ -69,8 +59,8 @@ def test_a_stored_campaign_has_exact_intervals_and_its_table(path: Path) -> None
 
 
 def test_the_page_of_campaigns_has_the_figures_of_the_ten_thousand_episodes() -> None:
-    page = rows("docs/campaigns.md", "| arena | episodes | goals | collisions |")
-    for table, robot in zip((page[1:3], page[4:6]), ("ground", "quadrotor"), strict=True):
+    page = table_rows("docs/campaigns.md", "| arena | episodes | goals | collisions |")
+    for table, robot in zip((page[:2], page[2:]), ("ground", "quadrotor"), strict=True):
         cells = stored(f"campaign/{robot}")
         for arena, episodes, goals, collisions, interventions, outside, closest in table:
             cell = cells[arena.strip("`"), "trained", "as-recorded"]
@@ -87,7 +77,7 @@ def test_the_page_of_campaigns_has_the_figures_of_changed_robots() -> None:
     air = stored("campaign_changed/quadrotor", "campaign_changed_untrained/quadrotor")
     perturbations: list[str] = []
     policy, tied = "", 0
-    for first, figure, *texts in rows("docs/campaigns.md", "| policy | figure |"):
+    for first, figure, *texts in table_rows("docs/campaigns.md", "| policy | figure |", heads=True):
         if first == "policy":
             perturbations = [text.strip("`") for text in texts]
             continue
@@ -109,10 +99,7 @@ def test_the_page_of_scans_has_the_stored_figures() -> None:
     walkers, tracks = stored("campaign_walkers/ground"), stored("campaign_walkers/ground+tracks")
     unfiltered, scans = stored("campaign_walkers_unfiltered/ground+tracks"), stored("campaign_scans/ground")
     faulty = stored("campaign_scans_faulty/ground")
-    page = rows("docs/results_scans.md", "| arena, policy | episodes |")
-    for label, *row in page:
-        if label == "arena, policy":
-            continue
+    for label, *row in table_rows("docs/results_scans.md", "| arena, policy | episodes |"):
         arena, policy, *more = (part.strip("` ") for part in label.split(","))
         touched = "walkers" in arena
         if policy.startswith("the same"):

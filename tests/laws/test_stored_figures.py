@@ -15,6 +15,7 @@ from scipy.special import stdtrit
 
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import evaluation_name, steps_to_learn
+from tests.laws.page_tables import table_rows
 
 pytestmark = pytest.mark.fast
 
@@ -53,18 +54,6 @@ def learned(stored: list[dict[str, Any]]) -> list[float]:
 def percents(stored: list[dict[str, Any]], column: str, joint: str = ", ") -> str:
     """Return the mean shares in both arenas, such as `99.8 %, 99.6 %`."""
     return joint.join(f"{100 * np.mean(shares(stored, arena, column)):.1f} %" for arena in ("default", "dense"))
-
-
-def table_rows(page: str, first: str) -> list[list[str]]:
-    """Return the cells of the rows of each table of a page whose first line begins with `first`."""
-    lines = [line.strip() for line in (ROOT / page).read_text().splitlines()]
-    rows = []
-    for head, line in enumerate(lines):
-        if line.startswith(first):
-            end = next((k for k in range(head, len(lines)) if not lines[k].startswith("|")), len(lines))
-            rows += [[cell.strip() for cell in row[1:-1].split("|")] for row in lines[head + 2 : end]]
-    assert rows, first
-    return rows
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.rglob("table.json")), ids=lambda path: str(path.relative_to(RESULTS)))

@@ -1,11 +1,7 @@
 """The service's core without a bus: requests go in, replies come out."""
 
-import numpy as np
-
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.service.client import read_reply, request_message
-from brakeline.safety.service.filter_client import accept
+from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.plan_token import PlanAuthenticator
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 
@@ -18,6 +14,10 @@ class Service:
         for model in models:
             self.models.install(model)
         self.answer = BatchHandler(self.models, self.counts, None if key is None else PlanAuthenticator(key))
+
+    def ask(self, topic, payload, *_, **__):
+        """Answer a client that takes the service for its bus."""
+        return self.answer(payload)
 
     def replies(self, *requests):
         payload = pb.RequestBatch(requests=requests).SerializeToString()
@@ -43,15 +43,9 @@ def with_fields(message, **values):
     return message
 
 
-class ServiceClient:
-    """A client of such a service, with one robot's backup plan."""
+class ServiceClient(SafetyClient):
+    """A client of such a service, without a bus."""
 
     def __init__(self, model, **service):
-        self.service, self.robot = Service(model, **service), model.robot
-        self.backup_plan = BackupPlan(model.robot)
-
-    def decide(self, state, action, obstacles=None, **more):
-        request = request_message(self.backup_plan, np.asarray(state, float), action, obstacles, **more)
-        answer = read_reply(self.service.replies(request)[0], request, self.robot)
-        accept(self.backup_plan, answer)
-        return answer
+        self.service = Service(model, **service)
+        super().__init__(self.service, model.robot)

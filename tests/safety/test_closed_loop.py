@@ -31,10 +31,15 @@ CORRIDOR = [
 
 
 def drive(ready, obstacles, policy, steps, seed):
-    """Return the decisions' kinds, the least clearance of the disc, the violations and the longest wait for a turn."""
+    """Drive at a policy's proposals behind the filter.
+
+    Returns the decisions by kind, the least clearance of the disc [m], the violations, the longest wait for a turn in
+    periods, and the length of the way [m].
+    """
     rng, shapes = np.random.default_rng(seed), Shapes.of(obstacles, 2)
     robot, safety = Unicycle((0, 0, 0), rng), InProcess(ready, accept_bound=1.0)
-    counts, least, violations, waiting, longest = dict.fromkeys((ALLOWED, ADJUSTED, FAILSAFE), 0), np.inf, 0, 0, 0
+    counts, least, way = dict.fromkeys((ALLOWED, ADJUSTED, FAILSAFE), 0), np.inf, 0.0
+    violations = waiting = longest = 0
     for k in range(steps):
         state, action = robot.measure(), np.array(policy(k, rng))
         answer = safety.decide(state, action, obstacles)
@@ -44,9 +49,9 @@ def drive(ready, obstacles, policy, steps, seed):
         path, turned = robot.step(answer.action)
         wants = abs(action[1]) > 0.3
         waiting = waiting + 1 if wants and abs(turned) < 0.01 else (0 if wants else waiting)
-        longest = max(longest, waiting)
-        least = min(least, shapes.distance(before[:2] + rotate(path, before[2])).min() - GROUND.footprint)
-    return counts, least, violations, longest
+        longest, way = max(longest, waiting), way + float(np.linalg.norm(path[-1]))
+        least = min(least, shapes.distance(before[:2] + rotate(path, before[2])).min() - ready.robot.footprint)
+    return counts, least, violations, longest, way
 
 
 def wild(k, rng):
@@ -61,7 +66,7 @@ def pushing(k, rng):
 @pytest.mark.parametrize("policy", [wild, pushing])
 @pytest.mark.parametrize("obstacles", [ROOM, CORRIDOR], ids=["room", "corridor"])
 def test_the_robot_hits_nothing_and_does_not_get_stuck(ready, obstacles, policy):
-    counts, least, violations, longest = drive(ready, obstacles, policy, 800, seed=11)
+    counts, least, violations, longest, _ = drive(ready, obstacles, policy, 800, seed=11)
     assert least > 0.0
     assert violations <= 2
     assert counts[ADJUSTED] > 10
@@ -73,7 +78,7 @@ def test_the_robot_hits_nothing_and_does_not_get_stuck(ready, obstacles, policy)
     "which", [("set-membership", "direct"), ("matrix-zonotope", "direct"), ("residual", "recursion")]
 )
 def test_the_other_model_sets_hit_nothing_either(models, which):
-    counts, least, violations, _ = drive(Filter(models[which]), ROOM, wild, 150, seed=12)
+    counts, least, violations, *_ = drive(Filter(models[which]), ROOM, wild, 150, seed=12)
     assert least > 0.0
     assert violations <= (1 if which[0] == "residual" else 0)
     assert counts[ALLOWED] + counts[ADJUSTED] > 40

@@ -1,4 +1,4 @@
-"""The clients give equal answers in process and over the bus; the fleet client decides for all robots, or for none."""
+"""The clients give equal answers in process and by a service; the fleet client decides for all robots, or for none."""
 
 from dataclasses import replace
 from inspect import signature
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.commands.ros2_command import Ros2Command
-from brakeline.errors import BadRequest, NoReply, SafetyError
+from brakeline.errors import BadRequest, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.identity import certified_name, identity_of
 from brakeline.messaging.moving_obstacles import MovingObstacles
@@ -71,14 +71,12 @@ def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
 WALL = Scan(np.full(360, 0.13), FAN, (0.0, 0.0, 0.0))  # 13 cm away all round
 
 
-class Unsent(SafetyClient):
-    """A client on an empty bus: it refuses bad values before it sends a request."""
-
-    def __init__(self, model):
-        self.robot, self.backup_plan, self.deadline = model.robot, BackupPlan(model.robot), 0.1
+def unsent(model):
+    """Return a client without a bus: it refuses bad values before it sends a request."""
+    return SafetyClient(None, model.robot)
 
 
-@pytest.fixture(params=[lambda model: InProcess(Filter(model), accept_bound=1.0), Unsent], ids=["in process", "client"])
+@pytest.fixture(params=[lambda model: InProcess(Filter(model), accept_bound=1.0), unsent], ids=["in process", "client"])
 def client(request, model):
     return request.param(model)
 
@@ -226,19 +224,12 @@ def facing():
 
 
 def decided(fleet, robots, actions):
-    """Return the answers, after retries until the service is found."""
-    while True:
-        try:
-            return fleet.decide([r.measure() for r in robots], actions, [[POST], [POST]])
-        except NoReply:
-            continue
+    return fleet.decide([r.measure() for r in robots], actions, [[POST], [POST]])
 
 
 @pytest.fixture
-def fleet(join, endpoint, model):  # noqa: F811
-    join("safety", listen=True).serve(DECIDE, Service(model).answer)
-    with FleetClient.open(endpoint, "ground", NAMES, deadline=5.0) as client:
-        yield client
+def fleet(model):
+    return FleetClient(Service(model), "ground", NAMES)
 
 
 def test_two_robots_that_drive_at_each_other_do_not_meet(fleet):

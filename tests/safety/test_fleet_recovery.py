@@ -1,6 +1,7 @@
 """Robots of a fleet that stand with reservations that touch creep apart, and no other robot loses its plan."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from brakeline.messaging.robot import Array
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import FAILSAFE, RECOVERING
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.service.client import read_reply, request_message
-from brakeline.safety.service.filter_client import Answer, accept
+from brakeline.safety.service.filter_client import Answer
+from brakeline.safety.service.fleet_client import FleetClient
 from tests.robots import GROUND
 from tests.safety.asked import apart
 from tests.safety.served import Service
@@ -20,27 +21,25 @@ PUSHED = 15
 Period = tuple[list[Answer], list[BackupPlan], Array]
 
 
+def fleet_of(model: ModelSet, count: int) -> FleetClient:
+    bus: Any = Service(model)
+    return FleetClient(bus, GROUND, [f"robot-{i}" for i in range(count)])
+
+
 def drive(model: ModelSet, poses: Sequence[Sequence[float]], push: float, periods: int) -> Iterator[Period]:
     """Let the first two robots drive straight ahead, and push the first one forward by `push` [m] before period PUSHED.
 
     Yield the answers, the backup plans and the true positions after each period. The other robots want to stand.
     """
-    rng, service = np.random.default_rng(0), Service(model)
-    robots, plans = [Unicycle(pose, rng) for pose in poses], [BackupPlan(GROUND) for _ in poses]
-    names = [f"robot-{i}" for i in range(len(poses))]
+    rng = np.random.default_rng(0)
+    robots, fleet = [Unicycle(pose, rng) for pose in poses], fleet_of(model, len(poses))
     actions = [[0.25, 0.0]] * 2 + [[0.0, 0.0]] * (len(poses) - 2)
     for step in range(periods):
         robots[0].state[0] += push * (step == PUSHED)
-        messages = [
-            request_message(plan, robot.measure(), action, known_free=True, actor=name, step=step, fleet=names)
-            for robot, plan, name, action in zip(robots, plans, names, actions, strict=True)
-        ]
-        replies = zip(service.replies(*messages), messages, strict=True)
-        answers = [read_reply(reply, message, GROUND) for reply, message in replies]
-        for robot, plan, answer in zip(robots, plans, answers, strict=True):
-            accept(plan, answer)
+        answers = fleet.decide([robot.measure() for robot in robots], actions, known_free=True)
+        for robot, answer in zip(robots, answers, strict=True):
             robot.step(answer.action)
-        yield answers, plans, np.array([robot.state[:2] for robot in robots])
+        yield answers, fleet.backup_plans, np.array([robot.state[:2] for robot in robots])
 
 
 @pytest.mark.parametrize("towards", [0.02, 0.03])
@@ -74,18 +73,10 @@ def test_a_way_out_takes_no_other_robots_space(model: ModelSet) -> None:
 
 def test_a_robot_whose_reservation_touches_nothing_keeps_it_although_its_sets_are_wider_now(model: ModelSet) -> None:
     """Its new reservation would touch the other robot's, which would then have no verified plan any more."""
-    near, names = 2.0 * GROUND.footprint + 0.05, ["left", "right"]
-    service, plans = Service(model), [BackupPlan(GROUND) for _ in names]
+    near, fleet = 2.0 * GROUND.footprint + 0.05, fleet_of(model, 2)
     states = [np.zeros(5), np.array([near, 0.0, np.pi, 0.0, 0.0])]
     for step, factor in enumerate((1.0, 8.0, 8.0)):
-        plans[0].widening.factors = factor, factor
-        messages = [
-            request_message(plan, state, [0.25, 0.0], known_free=True, actor=name, step=step, fleet=names)
-            for plan, state, name in zip(plans, states, names, strict=True)
-        ]
-        for plan, reply, message in zip(plans, service.replies(*messages), messages, strict=True):
-            answer = read_reply(reply, message, GROUND)
-            assert answer.verified
-            if plan is plans[0] and step:
-                assert answer.kind == FAILSAFE
-            accept(plan, answer)
+        fleet.backup_plans[0].widening.factors = factor, factor
+        answers = fleet.decide(states, [[0.25, 0.0]] * 2, known_free=True)
+        assert all(answer.verified for answer in answers)
+        assert not step or answers[0].kind == FAILSAFE

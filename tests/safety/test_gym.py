@@ -269,16 +269,15 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
     }
     many = VectorSafetyWrapper(vector, ready, 0.5, accept_bound=1.0, **views)
     observations, _ = many.reset(seed=[0, 1, 2])
-    alone = [BackupPlan(CAR) for _ in range(count)]
+    alone = [InProcess(ready, accept_bound=1.0) for _ in range(count)]
     fresh = np.zeros(count, dtype=bool)  # environments that the next step resets
     for _ in range(30):
         actions = policy.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
         resets = fresh if mode == gymnasium.vector.AutoresetMode.NEXT_STEP else np.zeros(count, dtype=bool)
         wanted = []
         for i in np.flatnonzero(~resets):
-            one = InProcess(ready, accept_bound=1.0)
-            one.backup_plan = alone[i]
-            wanted.append((i, one.decide(observations[i], normalised(CAR).action_to_control(actions[i]), discs())))
+            proposed = normalised(CAR).action_to_control(actions[i])
+            wanted.append((i, alone[i].decide(observations[i], proposed, discs())))
         observations, rewards, terminated, truncated, infos = many.step(actions)
         for i, decision in wanted:
             assert np.array_equal(infos["safety"][i].plan, decision.plan)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import FARTHEST
-from brakeline.messaging.range_image import RangeImage, directions
+from brakeline.messaging.range_image import directions
 from brakeline.safety.perception.image_coverage import BeamGrid
 from brakeline.safety.perception.kernels import group_kernels, occlusion_kernels, proximity_kernels, shadow_kernels
 from brakeline.safety.perception.kernels.shadow_kernels import AXIS_X, EXTENT, LENGTH, NEAR_RADIUS, NEAR_X, ROWS, TAPER
@@ -49,15 +49,6 @@ def test_a_patch_is_as_near_as_the_nearest_of_its_beams(seed, rings, columns):
     free, width = rng.random((rings, columns), np.float32), rng.integers(1, 3 * columns, rings)
     expected = twins.patch_minimum(free, width)
     assert np.array_equal(shadow_kernels.patch_minimum(free, width, len(expected)), expected)
-
-
-@settings(max_examples=30)
-@given(SEEDS)
-def test_a_rotation_matrix_is_that_of_the_range_image(seed):
-    attitude = np.random.default_rng(seed).normal(size=4)
-    attitude /= np.linalg.norm(attitude)
-    matrix = shadow_kernels.rotation_matrix(tuple(attitude))
-    assert np.allclose(matrix, RangeImage(np.ones((20, 40)), (0.0, 0.0, 0.0), tuple(attitude)).rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("sensor", [(0.2, -0.1, 0.3), (3.4, -0.1, 0.3)], ids=["inside", "outside"])

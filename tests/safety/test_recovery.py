@@ -45,9 +45,9 @@ def test_the_way_out_lowers_the_worst_violation_and_raises_none():
     assert lexicographically_less(small, large) and not lexicographically_less(large, large)
 
 
-def drive(ready, steps, see, action=(0.25, 0.0)):
-    """Yield the answer and the robot's true state before each step; see: state -> arguments of `decide`."""
-    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), InProcess(ready, accept_bound=1.0)
+def drive(ready, steps, see, action=(0.25, 0.0), noise=1.0):
+    """Yield the answer and the robot's true state before each step; see: (true, measured) -> arguments of `decide`."""
+    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise), InProcess(ready, accept_bound=1.0)
     for _ in range(steps):
         true, measured = robot.state.copy(), robot.measure()
         answer = safety.decide(measured, action, **see(true, measured))
@@ -159,24 +159,21 @@ def wall_scan(state, wall, **errors):
 @pytest.mark.parametrize("wall", [0.09, 0.1, 0.12])
 @pytest.mark.parametrize("errors", [{}, {"position_error": 0.03, "heading_error": 0.05}])
 def test_a_long_body_beside_a_wall_does_not_swing_its_rear_into_it(long_filter, wall, errors):
-    robot = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0)
-    safety = InProcess(long_filter, accept_bound=1.0)
-    for _ in range(12):
-        state = robot.measure()
-        robot.step(safety.decide(state, [0.1, 0.0], [], scan=wall_scan(state, wall, **errors)).action)
-        nearest = robot.state[1] + 0.25 * abs(math.sin(robot.state[2])) + 0.08
-        assert nearest < wall - 0.002
+    def see(_, measured):
+        return {"obstacles": [], "scan": wall_scan(measured, wall, **errors)}
+
+    for _, true in drive(long_filter, 13, see, (0.1, 0.0), noise=0.0):
+        assert true[1] + 0.25 * abs(math.sin(true[2])) + 0.08 < wall - 0.002
 
 
 def test_the_way_out_leads_away_from_the_nearest_of_map_and_scan(ready):
     """The scan shows a wall 6 cm to the left. The map shows a post on the other side, farther off."""
-    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0), InProcess(ready, accept_bound=1.0)
-    post, kinds = Obstacle("cylinder", (-0.3, -0.1), (0.08,)), []
-    for _ in range(60):
-        state = robot.measure()
-        answer = safety.decide(state, [0.25, 0.0], [post], scan=wall_scan(state, BODY + 0.06 - 0.075))
-        kinds.append(answer.kind)
-        robot.step(answer.action)
+    post = Obstacle("cylinder", (-0.3, -0.1), (0.08,))
+
+    def see(_, measured):
+        return {"obstacles": [post], "scan": wall_scan(measured, BODY + 0.06 - 0.075)}
+
+    kinds = [answer.kind for answer, _ in drive(ready, 60, see, noise=0.0)]
     assert kinds[0] == RECOVERING and kinds[-1] != RECOVERING
 
 

@@ -128,28 +128,18 @@ class Nothing(gymnasium.Env):
         return np.zeros(2), {"state": np.zeros(5), "obstacles": []}
 
 
-class Asking(ServiceClient):
-    """A client of a service, as a wrapper needs it."""
-
-    def fallback(self):
-        return self.backup_plan.fallback()
-
-    def reset(self):
-        self.backup_plan.reset()
-
-
 def test_a_wrapper_with_a_client_keeps_the_limit_that_it_was_given(model):
     loose, free = said(model, FLOWN), normalised(GROUND)
     client = InProcess(Filter(loose), accept_bound=1.0)
     SafetyWrapper(Nothing(), client, actions=free), SafetyWrapper(Nothing(), client, actions=free, accept_bound=0.27)
     with pytest.raises(TooLoose, match=r"accept-bound 0\.27"):
         SafetyWrapper(Nothing(), client, actions=free, accept_bound=0.01)
-    served = SafetyWrapper(Nothing(), Asking(loose), actions=free, accept_bound=0.01)
+    served = SafetyWrapper(Nothing(), ServiceClient(loose), actions=free, accept_bound=0.01)
     served.reset()
     with pytest.raises(TooLoose, match=r"at most 27 % .* accept_bound is 1 %"):
         served.step(np.zeros(2))
     for bad in (-1.0, 0.0, 7.0, math.nan):
-        for one in (client, Asking(loose)):
+        for one in (client, ServiceClient(loose)):
             with pytest.raises(ValueError, match="share above 0"):
                 SafetyWrapper(Nothing(), one, actions=free, accept_bound=bad)
 

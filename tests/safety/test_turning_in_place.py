@@ -20,7 +20,7 @@ from brakeline.safety.model.windows import FREE
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder
-from tests.safety.test_closed_loop import ROOM
+from tests.safety.test_closed_loop import ROOM, drive
 from tests.safety.unicycle import Unicycle
 
 ROBOT = robot_from_description(
@@ -229,15 +229,5 @@ def wild(k, rng):
 
 @pytest.mark.parametrize("policy", [pushing, wild])
 def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, policy):
-    rng, shapes, safety = np.random.default_rng(2), Shapes.of(ROOM, 2), InProcess(Filter(turner), accept_bound=1.0)
-    vehicle, least, waiting, longest, driven, failsafe = Unicycle((0, 0, 0), rng), np.inf, 0, 0, 0.0, 0
-    for k in range(700):
-        action = np.array(policy(k, rng))
-        answer = safety.decide(vehicle.measure(), action, ROOM)
-        failsafe += answer.kind == FAILSAFE
-        before = vehicle.state.copy()
-        path, turned = vehicle.step(answer.action)
-        waiting = waiting + 1 if abs(action[1]) > 0.5 and abs(turned) < 0.02 else 0
-        longest, driven = max(longest, waiting), driven + float(np.linalg.norm(path[-1]))
-        least = min(least, float(shapes.distance(before[:2] + rotate(path, before[2])).min()) - 0.15)
-    assert 0.0 < least < 0.1 and longest < 12 and driven > 4.0 and failsafe < 70
+    counts, least, _, longest, way = drive(Filter(turner), ROOM, policy, 700, seed=3)
+    assert 0.0 < least < 0.1 and longest < 12 and way > 4.0 and counts[FAILSAFE] < 70
