@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Event
 
 from brakeline.errors import BadStep, CheckpointError
-from brakeline.learner.checkpoint import CHECKPOINT, exists
+from brakeline.learner.checkpoint import CHECKPOINT, NOT_SAVED, exists
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.learner_output import LearnerOutput
@@ -51,10 +51,22 @@ class LearnerSettings:
 
 
 def main(settings: LearnerSettings) -> bool:
-    """Learn until the last step of the run, SIGINT or SIGTERM. Write a checkpoint and a policy file at the end.
+    """Learn as `learn` does, for a launcher that reads in the Health messages that a policy was not saved.
 
     Returns:
         Whether the run is complete.
+
+    Raises:
+        CheckpointError, Diverged, UnknownRobot, Unreachable: as `learn`.
+    """
+    return learn(settings)[0]
+
+
+def learn(settings: LearnerSettings) -> tuple[bool, str]:
+    """Learn until the last step of the run, SIGINT or SIGTERM. Write a checkpoint and a policy file at the end.
+
+    Returns:
+        Whether the run is complete, and why the policy was not saved; empty if it was.
 
     Raises:
         CheckpointError: the run cannot be resumed, or `out` holds a checkpoint and `resume` is False.
@@ -74,7 +86,7 @@ def main(settings: LearnerSettings) -> bool:
         loop = LearnerLoop(process, learner, settings)
         process.announce()
         loop.run()
-        return learner.done
+        return learner.done, process.notes.get(NOT_SAVED, "")
 
 
 class LearnerLoop:

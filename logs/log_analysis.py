@@ -17,6 +17,7 @@ from brakeline.logs.mcap_container import LogChannel
 from brakeline.logs.metrics import Metrics, merge_runs
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, Paths, by_run, find, without_copies
+from brakeline.logs.run_figures import unlogged_messages
 from brakeline.logs.run_groups import GroupedRun, compare_groups, differences
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.structured_text import parse_json
@@ -163,15 +164,21 @@ class RunAnalysis:
     def damage(self) -> list[str]:
         """Return what the log lacks, one line each: damage, and steps that a learner had and nobody recorded.
 
-        A count of published messages would miss the latter if an actor ended while no recorder ran.
+        A count of published messages would miss the latter if an actor ended while no recorder ran. So it would miss
+        the last messages of a run, which the run itself has counted.
         """
-        return [*cuts_in(self.log), *self._unrecorded_steps()]
+        return [*cuts_in(self.log), *self._unrecorded_steps(), *self._last_messages()]
 
     def _unrecorded_steps(self) -> Iterator[str]:
         for robot, metrics in self.metrics.learners.items():
             known = self.training[robot].recorded + self.metrics.fed_to(robot)
             if (lost := metrics.steps - known) > 0:
                 yield f"{lost} of the {metrics.steps} steps that the learner of {robot} had are not in the log"
+
+    def _last_messages(self) -> Iterator[str]:
+        known = sum(topic["missing"] for topic in self.metrics.topics().values())
+        if self.log.paths and (lost := unlogged_messages(self.log.paths[0])) > known:
+            yield f"{lost} messages that the run published are not in the log; only {known} of them leave a gap in it"
 
 
 def cuts_in(log: Log) -> list[str]:

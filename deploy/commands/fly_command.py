@@ -77,11 +77,13 @@ class FlyCommand:
         """Fly. Returns the exit status."""
         from brakeline.deploy.run.display import Display, summary
         from brakeline.deploy.run.launcher import Launcher, prepare
+        from brakeline.deploy.run.run_lock import only_launcher
 
         config = self.config()
         with run_folder(self.out) as folder:
             config = prepare(config, folder, resume=False)
-            with Display(errors if self.json else console, config.steps * len(config.flights)) as display:
+            shown = Display(errors if self.json else console, config.steps * len(config.flights))
+            with only_launcher(folder), shown as display:
                 figures = Launcher(config, folder, self.bus.settings(config, folder)).run(display)
         actors = [f"actor-{i}" for i in range(len(config.flights))]
         figures["flight"] = flight_figures(figures, actors[0])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Self
 
+from brakeline.deploy.commands.command_output import errors
 from brakeline.deploy.commands.common_options import BusOptions, Robot, Unprefixed, task_learner
 from brakeline.deploy.commands.train_command import STOPPED
 from brakeline.deploy.run.run_config import RunConfig
@@ -44,12 +45,19 @@ class LearnerCommand:
         """Learn until the last step, SIGINT or SIGTERM.
 
         Returns:
-            The exit status: 0, or `STOPPED` before the last step. So an engine that moves the process starts it again.
+            The exit status: 0, 1 if the policy was not saved, or `STOPPED` before the last step. So an engine that
+            moves the process starts it again.
         """
         from brakeline.learner.checkpoint import CHECKPOINT, exists
-        from brakeline.learner.learner_process import LearnerSettings, main
+        from brakeline.learner.learner_process import LearnerSettings, learn
 
         resume = self.resume or (self.resume_if_any and exists(self.out / CHECKPOINT))
         config = replace(self.learner, seed=self.seed, steps=self.steps)
         settings = LearnerSettings(self.endpoints.bus(), address(self.robot), self.out, resume, self.name, config)
-        return 0 if main(settings) else STOPPED
+        done, unsaved = learn(settings)
+        if unsaved:
+            errors.print(
+                f"THE POLICY WAS NOT SAVED: {unsaved}. Free some space, and repeat the command with --resume-if-any",
+                markup=False,
+            )
+        return int(bool(unsaved)) if done else STOPPED

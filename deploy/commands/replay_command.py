@@ -75,7 +75,7 @@ class ReplayCommand:
     def _replacement(self) -> Replacement:
         """Return the function that gives, for a robot, the filter to ask instead of the one that was in use."""
         from brakeline.deploy.data.certification import certify
-        from brakeline.deploy.data.model_store import model_for
+        from brakeline.deploy.data.model_store import check_description, model_for
         from brakeline.safety.filter.filter import Filter
         from brakeline.safety.model.dataset import Dataset
         from brakeline.safety.model.model_config import ModelConfig
@@ -85,6 +85,8 @@ class ReplayCommand:
 
         @cache
         def filter_for(robot: Robot) -> Filter:
+            if fitted is None:
+                check_description(robot, config)  # the log may be older than the description in use
             replacement = Filter(fitted or model_for(robot, config, ANY_BOUND), self.margin)
             if replacement.robot.name != robot.name:
                 raise ValueError(f"{self.data} has data of {replacement.robot.name}, but the log is of {robot.name}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -187,21 +187,27 @@ def train(
         from brakeline.deploy.run.display import Display, summary
         from brakeline.deploy.run.launcher import Launcher, prepare
         from brakeline.deploy.run.live_page import LivePage
+        from brakeline.deploy.run.run_lock import only_launcher
         from brakeline.deploy.run.verdict import not_saved
 
-    config = prepare(config, folder, resume)
-    if resume:
-        shown.print(f"resuming {folder} from the learner's last checkpoint; the log continues in a new file")
-    steps = config.steps * len(config.robots)
-    with LivePage(folder, browser) if watch else nullcontext() as page:
-        with Display(shown, steps, page) as display:
-            figures = Launcher(config, folder, bus.settings(config, folder)).run(display)
-        if as_json:
-            print_json(figures)
-        else:
-            summary(console, figures, verbose)
-        if page is not None:
-            page.stay(shown.print)
+    with ExitStack() as locked:
+        if resume:
+            locked.enter_context(only_launcher(folder))  # a run that is running stays as it is
+        config = prepare(config, folder, resume)
+        locked.enter_context(only_launcher(folder))
+        if resume:
+            shown.print(f"resuming {folder} from the learner's last checkpoint; the log continues in a new file")
+        steps = config.steps * len(config.robots)
+        with LivePage(folder, browser) if watch else nullcontext() as page:
+            with Display(shown, steps, page) as display:
+                figures = Launcher(config, folder, bus.settings(config, folder)).run(display)
+            locked.close()
+            if as_json:
+                print_json(figures)
+            else:
+                summary(console, figures, verbose)
+            if page is not None:
+                page.stay(shown.print)
     return STOPPED if not figures["finished"] else int(bool(not_saved(figures)))
 
 

@@ -35,12 +35,16 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def lock_at_once(file: Path) -> Iterator[bool]:
+def lock_at_once(file: Path, again: bool = False) -> Iterator[bool]:
     """Hold the lock in a file until the block ends, unless another process holds it. Yields whether it is held.
 
     On a file system without locks, nobody holds any: then it yields True.
+
+    Args:
+        file: the lock's file.
+        again: whether the same thread may enter it again inside the block.
     """
-    lock = FileLock(file, fallback_to_soft=False)
+    lock = FileLock(file, fallback_to_soft=False, is_singleton=again)
     try:
         lock.acquire(blocking=False)
     except Timeout:

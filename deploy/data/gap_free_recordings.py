@@ -52,7 +52,7 @@ def gap_free_recordings(
     """
     names, input_names = column_names(robot)
     recordings: list[GapFreeRecording] = []
-    gaps = lost = jumps = shared = 0
+    gaps = lost = silent = jumps = shared = 0
     for run in sorted({int(i) for table, _ in places.values() for i in np.unique(table.run)} or {0}):
         states, given = (
             [table.series(column, run) for table, column in (places[name] for name in columns)]
@@ -72,6 +72,8 @@ def gap_free_recordings(
         spans = [_uncut(time, at) for (time, _), at in zip(states, cuts, strict=True)]
         spans += [_uncut(states[i][0], indices) for i, indices in jump_rows.items()]
         spans += [_uncut(time, np.flatnonzero(np.diff(time) > hold), hold) for time, _ in inputs]
+        end = min(time[-1] for time, _ in states)
+        silent += len({float(at) for time, _ in inputs for at in time[np.diff(time, append=end) > hold]})
         losses = [_lost_messages(series, robot.period, hold) for series in inputs]
         lost += len({end for loss in losses for _, end in loss})
         spans += [_outside(loss) for loss in losses]
@@ -84,6 +86,10 @@ def gap_free_recordings(
                 recordings.append(GapFreeRecording(part, inputs, begin, end))
     counts = {"gaps in the stamps: the recording is cut there": gaps, "jumps of the pose": jumps}
     counts["times an input changed while messages of it are missing: the recording is cut there"] = lost
+    counts[
+        f"times no message of an input came for longer than {hold:g} s: the time after that is left out. If the robot "
+        "keeps an input until the next message, give a larger --hold"
+    ] = silent
     counts["rows with the stamp of the row before and another pose: left out"] = shared
     return recordings, [f"{count} {what}" for what, count in counts.items() if count]
 

@@ -60,11 +60,12 @@ def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
 def with_time(tables: list[Table], path: Path, options: LogOptions) -> list[Table]:
     """Return tables with their time, their source and the ranks that the user chose. Raises NoSource."""
     column, unit = options.fields.get(TIME, ""), options.units.get(TIME, "")
+    given = [options.fields.get(name, name) for name in options.units]
 
     def timed(table: Table) -> Table:
         if table.name:  # a topic or a type of messages: the reader has set its time
             return table
-        return with_message_fields(stamped(in_header_units(table), column, unit))
+        return with_message_fields(stamped(in_header_units(table, given), column, unit))
 
     return options.ranked([replace(timed(table), source=path.name) for table in tables])
 

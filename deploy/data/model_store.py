@@ -18,12 +18,13 @@ from brakeline.deploy.data.data_paths import method_path, model_path, note_mode,
 from brakeline.deploy.data.recording_origin import outdated
 from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.messaging.task_code import is_own_code
 from brakeline.safety.methods import METHODS, Model
-from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT
+from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT, ONE_STEP
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound
 from brakeline.safety.rivals.own_code import OwnCode
@@ -67,6 +68,32 @@ def model_for(
     return replace(model, robot=replace(model.robot, accept_bound=limit))
 
 
+def check_description(robot: Robot, model_config: ModelConfig) -> None:
+    """Check that `model_for` replaces nothing in use by something of another description, such as that of an old log.
+
+    Raises:
+        BadModel: the model set in use is of another description of the robot; or there is none, and the data set is.
+    """
+    from brakeline.deploy.data.simulated_recording import described_today
+    from brakeline.safety.model.dataset import Dataset
+
+    path = model_path(robot, model_config)
+    try:
+        if ModelSet.load(path).robot.layout() == robot.layout():
+            return
+        other = f"{path} is of another description of {robot.name}"
+    except BadModel:  # there is none, or none that can be read
+        path = record_path(robot.in_lockstep())
+        if not path.exists():
+            return
+        try:
+            described_today(Dataset.load(path), robot, path)
+            return
+        except BadData as error:
+            other = str(error)
+    raise BadModel(f"{other}. Give data of this description with --data")
+
+
 def put_to_use(model: ModelSet, data: Dataset, keys: Path | None) -> Path:
     """Write a model set to the path from which other commands load it, and return the path.
 
@@ -74,16 +101,21 @@ def put_to_use(model: ModelSet, data: Dataset, keys: Path | None) -> Path:
         model: the model set.
         data: the data set that it was fitted to.
         keys: folder of keys. If it holds the signing key, the model set is signed.
+
+    Raises:
+        Untrusted: the model set cannot be signed; the one before stays in use.
     """
     from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
 
     path = model_path(model.robot, model.model_config)
-    seal_of(path).unlink(missing_ok=True)  # the seal of the model set before
-    if keys is not None and (keys / KEY).exists():
-        ModelSigner.load(keys).sign(model, data).save(path)
-    else:
-        model.save(path)
-    note_mode(model.robot, model.model_config)
+    signed = ModelSigner.load(keys).sign(model, data) if keys is not None and (keys / KEY).exists() else None
+    with folder_lock(path.parent):
+        seal_of(path).unlink(missing_ok=True)  # the seal of the model set before
+        if signed is not None:
+            signed.save(path)
+        else:
+            model.save(path)
+        note_mode(model.robot, model.model_config)
     return path
 
 
@@ -96,10 +128,22 @@ def _load_or_build(path: Path, load: Callable[[], M], build: Callable[[], M], ac
             return load()
         except BadModel as error:
             if path.exists():
-                aside = path.with_suffix(".replaced")
-                path.replace(aside)  # somebody may want to know what it was
-                console.print(f"[yellow]{activity} again:[/] {error}; the file before is now {aside}")
+                aside = _copy_aside(path)  # somebody may want to know what it was
+                console.print(f"[yellow]{activity} again:[/] {error}; the file before is in {aside}, too")
         return build()
+
+
+def _copy_aside(path: Path) -> Path:
+    """Copy a file that will be replaced, and return the path of the copy. If that fails, move the file.
+
+    It stays, because its replacement may fail, and the reason may be a mistake in a description.
+    """
+    aside = path.with_suffix(".replaced")
+    try:
+        write_atomically(aside, path.read_bytes())
+    except OSError:  # nobody can read it
+        path.replace(aside)
+    return aside
 
 
 def _load_model_set(path: Path, robot: Robot) -> ModelSet:
@@ -123,7 +167,12 @@ def _existing(path: Path, robot: Robot) -> ModelSet:
 
 
 def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
-    if model_config.mode == AUTO and not record_path(robot).exists() and (shipped := _shipped(robot)) is not None:
+    automatic = False
+    if model_config.mode == AUTO:  # direct is the simulated robots' own; but a mode that was put to use stays
+        one_step = replace(model_config, mode=ONE_STEP)
+        automatic = path != model_path(robot, one_step)
+        model_config = replace(model_config, mode=DIRECT) if automatic else one_step
+    if automatic and not record_path(robot).exists() and (shipped := _shipped(robot)) is not None:
         console.print(
             f"{robot.name}: the model set that comes with Brakeline, {shipped.version} "
             f"(`brakeline collect {robot.kind}` records data for one of your own)"
@@ -146,9 +195,6 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
         console.print(f"[yellow]recording again:[/] {error}")
         load_or_record(robot.in_lockstep(), again=True)
         data = data_for(robot)
-    automatic = model_config.mode == AUTO
-    if automatic:
-        model_config = replace(model_config, mode=DIRECT)  # the simulated robots' own; `path` is of this mode too
     try:
         with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
             model, report = certify(data, model_config)

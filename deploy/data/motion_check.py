@@ -30,6 +30,7 @@ LIKE_UNIT = 0.06  # largest relative difference of a gain from a unit's: km/h an
 ALIKE = 1.5  # largest ratio of two gains with one cause: noise and curved paths change them a little
 LEAST_TURN = 0.5  # rad: a heading that changes less shows no unit
 HEADING_UNITS = ("rad", "deg", COMPASS)
+COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the mean of their differences' unit vectors
 UNCONVERTED = "unconverted"  # the reading of a heading without the conversion by --unit
 WORDS = {"deg": "degrees", COMPASS: "a compass heading (degrees, clockwise from y)"}
 
@@ -80,12 +81,15 @@ def needless_conversion(name: str, given: str, si: str) -> str:
 
 
 def heading_problem(log: AlignedLog, name: str, given: Mapping[str, str]) -> str:
-    """Return the sentence for a heading that is not in rad, by the motion or else by the speeds; empty if it may be."""
+    """Return the sentence for a heading that is not in rad, or mirrored, by the motion or else by the speeds.
+
+    It is empty if the heading may be right.
+    """
     unit, score = heading_unit(log, name, given.get(name, ""))
     if unit == "rad" and score <= SAME_CORRELATION:
         unit, score = _clear(speed_scores(log, name, given.get(name, "")))
     if unit == "rad":
-        return ""
+        return mirrored_heading(log, name)
     if unit == UNCONVERTED:
         return needless_conversion(name, given[name], "rad")
     return (
@@ -127,18 +131,51 @@ def speed_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, float
     An omnidirectional robot moves in every direction, so only its speeds show the unit of its heading. The score is the
     largest correlation of another column with one of the two speeds. Speeds along x and y do not count.
     """
+    return {unit: max(_speed_matches(log, name, angles)) for unit, angles in _readings(log, name, given).items()}
+
+
+def _speed_matches(log: AlignedLog, name: str, angles: Array) -> tuple[float, float]:
+    """Return the largest correlation of a column with the motion along angles (rows,) [rad], and of one across them.
+
+    Both are 0 if the angles hardly change. name: of the heading, which is no such column; nor are speeds along x and y.
+    """
+    if np.ptp(angles) <= LEAST_TURN:
+        return 0.0, 0.0
     along_axes = speeds_of_motion(log, "")
     others = [
         other
         for other in log.columns
         if other not in (*log.positions, name) and speed_fit(log, other, along_axes, other in log.inputs) is None
     ]
-    scores = {}
-    for unit, angles in _readings(log, name, given).items():
-        speeds = _along_and_across(log, angles) if np.ptp(angles) > LEAST_TURN else []
-        fits = (best_fit(log, other, speeds, other in log.inputs) for other in others)
-        scores[unit] = max((fit.correlation for fit in fits), default=0.0)
-    return scores
+    along, across = (
+        max((best_fit(log, other, [speed], other in log.inputs).correlation for other in others), default=0.0)
+        for speed in _along_and_across(log, angles)
+    )
+    return along, across
+
+
+def mirrored_heading(log: AlignedLog, name: str) -> str:
+    """Return what to do if a heading turns against the direction of motion; empty if it does not."""
+    direction, middle = directions_of_motion(log)
+    angles = log.columns[name][middle]
+    if not len(angles) or np.ptp(np.unwrap(log.columns[name])) < LEAST_TURN:
+        return ""
+    # A robot that drives backwards moves at pi to its heading, so that only twice the angles can be compared.
+    same, mirrored = (complex(np.exp(2j * (direction - sign * angles)).mean()) for sign in (1.0, -1.0))
+    if abs(mirrored) >= COHERENT and abs(same) <= INCOHERENT:
+        from_y = abs(abs(0.5 * math.atan2(mirrored.imag, mirrored.real)) - math.pi / 2.0) < 0.4
+    else:
+        as_it_is = log.columns[name]
+        right, negated, turned = (_speed_matches(log, name, a) for a in (as_it_is, -as_it_is, math.pi / 2.0 - as_it_is))
+        if max(negated) <= max(SAME_CORRELATION, max(right) + 0.1):
+            return ""
+        from_y = sum(turned) > sum(negated) + 0.1
+    formula = f"pi/2 - {name}" if from_y else f"-{name}"
+    repair = "swap the columns x and y" if from_y else "change the sign of y"
+    return (
+        f"{name} grows clockwise, but x and y show that it must grow counterclockwise from the x axis. Write {formula} "
+        f"into the column, or {repair}, whichever of the two is wrong"
+    )
 
 
 def _readings(log: AlignedLog, name: str, given: str) -> dict[str, Array]:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Mapping
 
@@ -13,11 +12,11 @@ import numpy as np
 
 from brakeline.deploy.data.aligned_log import AlignedLog, align
 from brakeline.deploy.data.motion_check import (
+    COHERENT,
     FEWEST_SPANS,
     UNRELATED,
     best_fit,
     contradictions,
-    directions_of_motion,
     likely_unit,
     span_means,
     speed_fit,
@@ -29,7 +28,6 @@ from brakeline.deploy.data.sources.source_table import Array
 from brakeline.deploy.data.unit_table import AS_IT_IS, unit_option
 from brakeline.errors import NoSource
 
-COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the mean of their differences' unit vectors
 FAR_GAIN = {False: 2.0, True: 5.0}  # of a state, of an input: farther from 1 it is another unit
 BACKWARDS = 0.3  # of the usual top speed: a robot that moves so fast against its heading drives backwards
 CONFIRMED = 0.8  # least correlation of a speed with the motion, if its column and those of the pose are right
@@ -91,34 +89,12 @@ def wrong_senses(log: AlignedLog, heading: str, units: Mapping[str, str], given:
         units: SI unit that each column should have.
         given: units that `--unit` names; a column that the user takes as it is counts as right.
     """
-    if heading and (mirrored := mirrored_heading(log, heading)):
-        return [mirrored]
     speeds = speeds_of_motion(log, heading)
     problems = []
     for name, unit in units.items():
         if unit in QUANTITIES and name in log.columns and given.get(name) != AS_IT_IS:
             problems.append(_wrong_sense(log, name, unit, speeds) or _world_speed_problem(log, name, unit, heading))
     return [problem for problem in problems if problem]
-
-
-def mirrored_heading(log: AlignedLog, name: str) -> str:
-    """Return what to do if a heading turns against the direction of motion; empty if it does not."""
-    direction, middle = directions_of_motion(log)
-    angles = log.columns[name][middle]
-    if not len(angles) or np.ptp(np.unwrap(log.columns[name])) < 0.5:
-        return ""
-    # A robot that drives backwards moves at pi to its heading, so that only twice the angles can be compared.
-    same, mirrored = (complex(np.exp(2j * (direction - sign * angles)).mean()) for sign in (1.0, -1.0))
-    if abs(mirrored) < COHERENT or abs(same) > INCOHERENT:
-        return ""
-    offset = 0.5 * math.atan2(mirrored.imag, mirrored.real)
-    from_y = abs(abs(offset) - math.pi / 2.0) < 0.4
-    formula = f"pi/2 - {name}" if from_y else f"-{name}"
-    repair = "swap the columns x and y" if from_y else "change the sign of y"
-    return (
-        f"{name} grows clockwise, but x and y show that it must grow counterclockwise from the x axis. Write {formula} "
-        f"into the column, or {repair}, whichever of the two is wrong"
-    )
 
 
 def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, Array]]) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.sources.source_table import Array, Table, folded
 from brakeline.deploy.data.unit_table import NAMES as UNIT_NAMES
 from brakeline.deploy.data.unit_table import factor, si_of, split_header, unknown_unit
 from brakeline.errors import NoSource
@@ -84,8 +85,12 @@ def stamped(table: Table, column: str = "", unit: str = "") -> Table:
     return _cut_at_steps_back(_rows(whole, np.flatnonzero(valid)))
 
 
-def in_header_units(table: Table) -> Table:
-    """Return a table of columns `NAME [UNIT]` as columns NAME in SI units; the stamps stay as they are."""
+def in_header_units(table: Table, given: Sequence[str] = ()) -> Table:
+    """Return a table of columns `NAME [UNIT]` as columns NAME in SI units; the stamps stay as they are.
+
+    given: columns of which the user names the unit, which counts, not that of the header. Their values stay.
+    """
+    chosen = {folded(split_header(name)[0]) for name in given}
     columns: dict[str, Array] = {}
     units: dict[str, str] = {}
     notes: list[str] = []
@@ -95,6 +100,9 @@ def in_header_units(table: Table) -> Table:
         as_it_is = plain in table.columns or plain in columns or _letters(plain) in NAMES
         if scale is None or as_it_is or factor(unit, "s") is not None:
             columns[name] = values
+            continue
+        if folded(plain) in chosen:
+            columns[plain] = values
             continue
         columns[plain], units[plain] = values * scale, si_of(unit)
         if scale != 1.0:

@@ -25,6 +25,7 @@ from brakeline.logs.json_values import finite
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import count_by_key
 from brakeline.logs.recorded_robots import RecordedRobots
+from brakeline.logs.run_figures import FIGURES
 from brakeline.logs.watch.run_history import NOTE, RunHistory, history_to_note, run_totals, totals_to_health
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
@@ -47,7 +48,6 @@ RECORDER_TIMEOUT = 30.0  # s after which the run starts without a recorder, whos
 UNBEGUN_TIMEOUT = 0.5  # s, the same for a run in which nothing has begun
 LAST_MESSAGES_TIMEOUT = 2.0  # s, longest wait for the last messages of processes that have ended
 SILENCE = 0.5  # s without a message after which the launcher takes the last message to have arrived
-FIGURES = "figures.json"
 SEGMENTS = f"{Path(LOG).stem}*{Path(LOG).suffix}"  # the files of a log
 
 

@@ -15,12 +15,12 @@ LOCK = ".launcher.lock"
 
 @contextmanager
 def only_launcher(folder: Path) -> Iterator[None]:
-    """Hold the lock of a run's folder until the block ends.
+    """Hold the lock of a run's folder until the block ends. The same thread may enter it again inside the block.
 
     Raises:
         LaunchError: another launcher holds it: the run is running.
     """
-    with lock_at_once(folder / LOCK) as held:
+    with lock_at_once(folder / LOCK, again=True) as held:
         if not held:
             raise LaunchError(f"{folder} is running{_process(folder)}: end it first, or give another --out")
         yield

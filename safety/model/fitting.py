@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +31,7 @@ from brakeline.safety.model.model_config import (
     ModelConfig,
 )
 from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.set_shape import least_half_widths
 from brakeline.safety.model.turning_in_place import InPlace, inside, over_plan, standing_limits, turning
 from brakeline.safety.model.windows import (
     Windows,
@@ -71,7 +74,7 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         chord_deviations.append(_length_envelope(every.z, every.chord_deviation, model_config.inflation))
         if model_config.mode == DIRECT:
             after, later = predicted_outputs(robot, seen.y), predicted_outputs(robot, rest.y)
-            steps.append(_error_bound(seen.z, after, rest.z, later, model_config, columns, MOST_ATOMS // horizon))
+            steps.append(_error_bound(robot, seen.z, after, rest.z, later, model_config, columns))
         else:
             steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, model_config))
     whole = windows(data, horizon, kind)
@@ -128,7 +131,7 @@ def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlac
                 check_regressors(
                     regressors[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE)
                 )
-            steps.append(_error_bound(z, y, z_bound, y_bound, model_config, turns, MOST_ATOMS // robot.horizon))
+            steps.append(_error_bound(robot, z, y, z_bound, y_bound, model_config, turns))
         except (BadData, ErrorBoundError):
             return None
     return InPlace(tuple(steps), np.where(free, _range(robot, np.vstack([z, z_bound])), limits))
@@ -200,20 +203,27 @@ def _scalar(bounds: list[tuple[Array, float]], nz: int) -> ErrorBound:
 
 
 def _error_bound(
+    robot: Robot,
     z: Array,
     y: Array,
     z_bound: Array,
     y_bound: Array,
     model_config: ModelConfig,
     columns: NDArray[np.bool_],
-    most_atoms: int,
 ) -> ErrorBound:
     """Return the error bound of the configured kind. The residual's envelope is the noise bound of all three kinds.
 
+    Data without noise would give an envelope of rounding errors. So the median of its half-widths is at least that of
+    `least_half_widths`.
+
     A matrix zonotope has one row of W for each sample, and more samples do not make it smaller. So it uses at most
-    `most_atoms` samples, spread evenly over the data.
+    `MOST_ATOMS` samples over the horizon, spread evenly over the data.
     """
     trusted = residual(z_bound, y_bound, least_squares(z, y, columns), model_config.inflation)
+    least = least_half_widths(robot, np.vstack([y, y_bound])[:, None])[0]
+    missing = least - np.median(trusted.half_widths(z_bound), axis=0)
+    trusted = replace(trusted, w=trusted.w + np.maximum(missing, 0.0))
+    most_atoms = MOST_ATOMS // robot.horizon
     if model_config.certificate == RESIDUAL:
         return trusted
     if model_config.certificate == MATRIX_ZONOTOPE and len(z_bound) > most_atoms:
@@ -241,7 +251,7 @@ def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, model_co
     rng = np.random.default_rng((model_config.seed, k))
     turned = [_turned(robot, w, k, rng) for w in (fit, bound)]
     columns = np.abs(turned[0][0]).max(0) > 0.0
-    return _error_bound(*turned[0], *turned[1], model_config, columns, MOST_ATOMS // robot.horizon)
+    return _error_bound(robot, *turned[0], *turned[1], model_config, columns)
 
 
 def _turned(robot: Robot, w: Windows, k: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -182,6 +182,29 @@ def test_steps_that_a_learner_had_and_nobody_recorded_are_missing(tmp_path: Path
     assert cuts == ["3 of the 8 steps that the learner of ground had are not in the log"] * (lost == 3)
 
 
+@pytest.mark.parametrize(
+    ("saved", "said"),
+    [
+        ({"log_messages": {"missing": 4}}, True),
+        ({"log_messages": {"missing": 2}}, False),
+        ({"log_messages": None}, False),
+    ],
+    ids=["last", "counted in the log", "without a log"],
+)
+def test_the_last_messages_of_a_run_are_missing_by_its_own_count(tmp_path: Path, saved: Any, said: bool) -> None:
+    """Nothing in the log follows them: the last sign of life of their process is lost, too."""
+    writer, key = Writer(), "step/ground/actor-0"
+    for k in range(2):
+        writer.put(key, pb.Step(robot="ground", actor="actor-0", step=2 * k), always=True)
+        writer.published[key, 1] += 2
+    (tmp_path / "figures.json").write_text(json.dumps(saved))
+    figures = analyse(writer.write(tmp_path / "run.mcap"))
+    assert figures["topics"][key]["missing"] == 2
+    assert figures["cuts"] == [
+        "4 messages that the run published are not in the log; only 2 of them leave a gap in it"
+    ] * int(said)
+
+
 def test_steps_that_a_feeder_published_from_other_logs_are_not_missing(tmp_path: Path) -> None:
     writer = Writer()
     published = {"logged/ground/a": 4, "logged/ground/b": 3, "logged/quadrotor/a": 9}

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from brakeline.deploy.data.log_options import LogOptions
-from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
+from brakeline.deploy.data.sources.source_table import Array, Table, folded, notes_of
 from brakeline.deploy.data.unit_table import AS_IT_IS, factor, in_si, si_of, split_header, unknown_unit
 from brakeline.errors import NoSource
 from brakeline.messaging.labels import split_label
@@ -91,7 +91,7 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
             # `x` of a message may point north: match by name only in files of columns.
             plain = [table for table in tables if not table.name]
             candidates = [(t, name) for t in plain if name in t.columns]
-            candidates = candidates or [(t, f) for t in plain for f in t.columns if _folded(f) == _folded(name)]
+            candidates = candidates or [(t, f) for t in plain for f in t.columns if folded(f) == folded(name)]
             candidates = candidates or [(t, usual[name]) for t in tables if usual.get(name) in t.columns]
             wanted = f"a column {name!r}" + (f" or a message with {usual[name]}" if name in usual else "")
         candidates = first_ranked(candidates)
@@ -128,8 +128,9 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
 
 
 def fields_named(tables: Sequence[Table], place: str) -> list[Place]:
-    """Return the fields that `TABLE/FIELD` or `FIELD` names."""
-    return [(t, f) for t in tables for f in t.columns if place in (f"{t.name}/{f}", f)]
+    """Return the fields that `TABLE/FIELD` or `FIELD` names, or the header `FIELD [UNIT]` of a file of columns."""
+    named = [(t, f) for t in tables for f in t.columns if place in (f"{t.name}/{f}", f)]
+    return named or [(t, f) for t in tables for f in t.columns if not t.name and f == split_header(place)[0]]
 
 
 def first_ranked(candidates: Sequence[Place]) -> list[Place]:
@@ -168,11 +169,6 @@ def in_header_unit(place: Place) -> tuple[Place, str]:
     if not unit or si_of(unit) == "s":
         return place, table.units.get(column, "")
     return with_values(place, table.columns[column] * (factor(unit) or 1.0)), si_of(unit)
-
-
-def _folded(name: str) -> str:
-    """Return a name without case, spaces and signs."""
-    return "".join(character for character in name.lower() if character.isalnum())
 
 
 def _label(place: Place) -> tuple[str, str]:

@@ -62,6 +62,11 @@ def natural_order(file: Path) -> list[tuple[int, str]]:
     return [(len(part), part) for part in re.split(r"(\d+)", str(file))]
 
 
+def folded(name: str) -> str:
+    """Return the name of a column without case, spaces and signs."""
+    return "".join(character for character in name.lower() if character.isalnum())
+
+
 def notes_of(tables: Sequence[Table]) -> tuple[str, ...]:
     """Return the notes of all tables, each once."""
     return tuple(dict.fromkeys(note for table in tables for note in table.notes))

@@ -134,15 +134,18 @@ def test_a_measured_angle_is_in_the_unit_of_the_input_that_it_follows(steered, t
     assert (status == 0, said in text) == (not said, True), text
 
 
-def omnidirectional_log(path, turned=1.0, along_axes=False):
-    """Write the log of a robot that drives in every direction while it turns. turned: the unit of its heading."""
+def omnidirectional_log(path, turned=1.0, along_axes=False, zero=0.0):
+    """Write the log of a robot that drives in every direction while it turns.
+
+    turned: the unit of its heading; zero: its heading if it looks along x.
+    """
     rng, rows, pose, speeds, given = np.random.default_rng(0), [], np.zeros(3), np.zeros(3), np.zeros(3)
     for k in range(2400):
         if k % 2 == 0 and rng.random() < 0.1:
             given = rng.uniform([-0.8, -0.6, -0.3], [0.8, 0.6, 1.2]) * (rng.random() > 0.2)
         rotation = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
         linear, heading = (speeds[:2], pose[2]) if along_axes else (rotation @ speeds[:2], wrap(pose[2]))
-        seen = [*pose[:2], turned * heading, *speeds]
+        seen = [*pose[:2], zero + turned * heading, *speeds]
         rows.append([*(np.array(seen) + rng.uniform(-0.003, 0.003, 6)), *given])
         pose, speeds = pose + 0.05 * np.array([*linear, speeds[2]]), speeds + 0.3 * (given - speeds)
     names = ("x", "y", "heading", "ahead", "aside", "turn", "cmd_ahead", "cmd_aside", "cmd_turn")
@@ -164,6 +167,28 @@ def test_the_speeds_of_an_omnidirectional_robot_show_that_its_heading_is_in_degr
     assert status == 0, text
     status, text = imported(right, capsys, "--unit", "heading=deg", robot=file)
     assert status == 1 and "heading is in rad already" in text
+
+
+@pytest.mark.parametrize(
+    ("zero", "said"),
+    [
+        (0.0, "Write -heading into the column, or change the sign of y"),
+        (math.pi / 2.0, "Write pi/2 - heading into the column, or swap the columns x and y"),
+    ],
+)
+def test_the_speeds_of_an_omnidirectional_robot_show_that_its_heading_grows_clockwise(tmp_path, capsys, zero, said):
+    """Its direction of motion does not: `robot new` noted nothing, and `import` that it may slip."""
+    right, wrong = (
+        omnidirectional_log(tmp_path / "right.csv"),
+        omnidirectional_log(tmp_path / "wrong.csv", -1.0, zero=zero),
+    )
+    file = tmp_path / "omni.toml"
+    assert main(["robot", "new", str(file), "--from", str(wrong)]) == 1
+    assert said in capsys.readouterr().err and not file.exists()
+    assert main(["robot", "new", str(file), "--from", str(right)]) == 0
+    capsys.readouterr()
+    status, text = imported(wrong, capsys, robot=file)
+    assert status == 1 and said in text
 
 
 def test_speeds_along_x_and_y_show_no_unit_of_the_heading(tmp_path, capsys):

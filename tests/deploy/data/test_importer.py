@@ -318,7 +318,15 @@ def test_an_input_is_held_and_forgotten_after_a_while():
     values[20:40, 5:] = np.nan  # nobody spoke for 4 s
     made = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
     assert lengths(made) == [23, 59], "5 periods after its last word it is forgotten"
-    assert lengths(resample([table(time, values)], porter(), LogOptions(), hold=10.0)) == [99]
+    said = "1 times no message of an input came for longer than 1 s: the time after that is left out"
+    assert any(said in note and "give a larger --hold" in note for note in made.report.notes)
+    values[50:, 5:] = np.nan  # its last message counts, too
+    ended = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
+    assert lengths(ended) == [23, 13] and any(note.startswith(f"2{said[1:]}") for note in ended.report.notes)
+    time, values = steady()
+    values[20:40, 5:] = np.nan
+    made = resample([table(time, values)], porter(), LogOptions(), hold=10.0)
+    assert lengths(made) == [99] and not any("no message of an input" in note for note in made.report.notes)
 
 
 def test_periods_begin_where_inputs_change_and_an_input_that_changed_within_counts_by_its_mean():

@@ -226,6 +226,24 @@ def test_a_header_names_the_unit_of_a_column_beside_one_of_the_same_name(driven,
     assert tomllib.loads(file.read_text())["input"]["command speed"]["high"] == pytest.approx(0.6, abs=0.01)
 
 
+@pytest.mark.parametrize("unit", ["deg", "rad", "1"])
+def test_a_unit_that_an_option_names_counts_instead_of_that_in_the_header(driven, plain, tmp_path, unit):
+    """Before, both counted: positions in mm became a thousand times too small, and a wrong header stayed wrong."""
+    time, values = driven[0], driven[1].copy()
+    values[:, 2] = np.degrees(values[:, 2]) if unit == "deg" else values[:, 2]
+    values[:, :2] *= 1000.0
+    names = [{"x": "x [mm]", "y": "Y (mm)", "heading": "heading [deg]"}.get(name, name) for name in COLUMNS]
+    path = write_csv(tmp_path / "drive.csv", time, values, names)
+    units = ("--unit", "x=mm", "y=mm", f"heading={unit}")
+    for places in ([], ["--map", "heading=heading [deg]", "y=Y (mm)"], ["--map", "y=Y"]):
+        same(imported(path, *places, *units), plain, 1e-8)
+    if unit == "deg":
+        same(imported(path, "--map", "heading=heading [deg]"), plain, 1e-8)
+    mine = tmp_path / "my.toml"
+    assert main(["robot", "new", str(mine), "--from", str(path), "--unit", "x=mm", "Y=mm", f"heading={unit}"]) == 0
+    assert robot_named(str(mine)).heading is not None and "turn rate [rad/s]" in robot_named(str(mine)).action
+
+
 def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
     path = write_csv(tmp_path / "drive.csv", *driven)
     for word, said in (("v=deg", "v is in m/s"), ("v=furlong", "UNIT is one of"), ("why=deg", "must be one of x, y")):

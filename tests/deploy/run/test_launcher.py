@@ -9,6 +9,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +18,13 @@ from typing import Any
 import pytest
 
 from brakeline.actors.actor_settings import FlightSettings
+from brakeline.deploy.commands.common_options import RunBusOptions
+from brakeline.deploy.commands.train_command import train
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.processes import CONFIG, UNFINISHED, ProcessSpec, write_endpoint
 from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, encode, load
+from brakeline.deploy.run.run_keys import make_run_keys
 from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.errors import DamagedPart, LaunchError
@@ -177,25 +182,45 @@ def test_a_learner_with_a_checkpoint_gets_no_logs_of_another_run(tmp_path: Path)
         prepare(with_other, folder, resume=True)
 
 
-def test_a_run_that_is_running_is_not_resumed_and_its_lock_ends_with_its_process(tmp_path: Path) -> None:
-    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+@contextmanager
+def running_elsewhere(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run's folder in another process."""
     hold = f"""
 import time
 from pathlib import Path
 from brakeline.deploy.run.run_lock import only_launcher
-with only_launcher(Path({str(tmp_path)!r})):
+with only_launcher(Path({str(folder)!r})):
     print("held", flush=True)
     time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE) as holder:
         try:
             assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
-            with pytest.raises(LaunchError, match=rf"is running \(process {os.getpid()}\)"):
-                launcher_in(tmp_path).run()
+            yield
         finally:
             holder.kill()
+
+
+def test_a_run_that_is_running_is_not_resumed_and_its_lock_ends_with_its_process(tmp_path: Path) -> None:
+    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+    with running_elsewhere(tmp_path), pytest.raises(LaunchError, match=rf"is running \(process {os.getpid()}\)"):
+        launcher_in(tmp_path).run()
     with only_launcher(tmp_path):
         pass
+
+
+def test_a_resumption_changes_nothing_of_a_run_that_is_running(tmp_path: Path) -> None:
+    """Before, it wrote new keys, with which the processes of the run could not start again."""
+    config = RunConfig(method="none")
+    (tmp_path / CONFIG).write_text(encode(config))
+    make_run_keys(config, tmp_path)
+    checkpoint.save(tmp_path / "learner" / CHECKPOINT, {}, {})
+    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+    with running_elsewhere(tmp_path):
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        with pytest.raises(LaunchError, match="is running"):
+            train(config, tmp_path, True, RunBusOptions(), as_json=True)
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])

@@ -7,17 +7,19 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.commands.replay_command import ReplayCommand
+from brakeline.deploy.data.data_paths import model_path, record_path
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.run.replay_run import APART, Difference, differences, replay
-from brakeline.errors import LogError
+from brakeline.errors import BadModel, LogError
 from brakeline.logs.reader import open_log
 from brakeline.logs.recorder import entry
 from brakeline.logs.segment import open_segment
@@ -88,6 +90,24 @@ def test_another_error_bound_and_other_data_can_be_replayed(log, few_data, tmp_p
     assert sum(count for row in wider["kinds"].values() for count in row.values()) == STEPS
     same = figures(*words, "--data", record_path(GROUND))
     assert same["kinds"] == wider["kinds"] and same["instead"]["data"] == str(record_path(GROUND))
+
+
+def test_the_replay_of_an_old_log_replaces_no_model_set_and_no_data_in_use(few_data, tmp_path, monkeypatch) -> None:
+    """Before, it fitted and recorded the robot of the log into the files that the other commands load."""
+    model = model_for(GROUND, ModelConfig())
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    record, path = record_path(GROUND), model_path(GROUND, ModelConfig())
+    record.parent.mkdir()
+    shutil.copy(few_data, record)
+    of_then = ReplayCommand(certificate="residual")._replacement()
+    with pytest.raises(BadModel, match=r"before the description of ground changed .* Give data of this description"):
+        of_then(replace(GROUND, period=0.25))
+    model.save(path)
+    before = {file: file.read_bytes() for file in record.parent.iterdir()}
+    with pytest.raises(BadModel, match=r"residual-direct.safetensors is of another description of ground"):
+        of_then(replace(GROUND, sight=GROUND.sight + 1.0))
+    assert {file: file.read_bytes() for file in record.parent.iterdir()} == before
+    assert of_then(GROUND).version == model.version
 
 
 def test_requests_older_than_known_free_keep_their_meaning(data_folder: Path, tmp_path: Path) -> None:
