@@ -252,12 +252,15 @@ def sets_around(predictor, root, weight, T, kept, sets, more_sets, z):
 
 def score(predictor, root, weight, states, executed, W, M, kappa, w, scored):
     """`window_kernels.score`."""
-    _, _, _, _, others, heading, _, d, _ = predictor
+    _, _, _, _, others, heading, arms, d, _ = predictor
     window, after = np.concatenate([states[0, others], executed.ravel()]), states[1:].copy()
     after[:, :d] = (states[1:, :d] - states[0, :d]) @ turning(states[0, heading], d)
     after[:, heading] = np.angle(np.exp(1j * (states[1:, heading] - states[0, heading])))
+    turns = [turning(angle, d) for angle in after[:, heading]]
+    discs = [[row[:d] + turn @ arm - arm for row, turn in zip(after, turns, strict=True)] for arm in arms]
+    after = np.hstack([after, *discs])
     widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
-    off = np.abs(after - rollouts(predictor, window[None])[0, :, : states.shape[1]])
+    off = np.abs(after - rollouts(predictor, window[None])[0])
     shares = off / (widths * stretches(predictor, root, weight, window[None])[0][:, None])
     of_scored = shares[:, scored].max()
     return max(of_scored, shares[0].max()), of_scored
