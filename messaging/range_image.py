@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
-from brakeline.messaging.scan import check_numbers, check_unit
+from brakeline.messaging.scan import check_largest, check_numbers, check_unit
 from brakeline.messaging.value_equality import ComparedByValue
 
 Array = NDArray[np.float64]
@@ -90,6 +90,7 @@ class RangeImage(ComparedByValue):
             raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
         bounds = (self.range_error, self.position_error, self.angle_error, self.speed, self.age)
         check_numbers("range image", (*self.at, *self.attitude, *self.mount), self.far, bounds, self.least_width)
+        check_largest(self.ranges, self.far)
         if abs(math.hypot(*self.attitude) - 1.0) > 1e-3:
             raise BadScan("a range image's attitude is a unit quaternion")
         if self.angle_error > MAX_ANGLE_ERROR:

@@ -35,6 +35,16 @@ def check_unit(ranges: object) -> None:
         raise BadScan(f"ranges are in m: an array of {ranges.dtype} may be in mm; divide, or give `.astype(float)`")
 
 
+def check_largest(ranges: Array, far: float) -> None:
+    """Refuse ranges far beyond `far` [m], which means no hit. If they were in mm, all would mean free space.
+
+    Raises:
+        BadScan: a range is over `BEYOND_FAR` times `far`.
+    """
+    if (largest := float(np.nan_to_num(ranges).max(initial=0.0))) > BEYOND_FAR * far:
+        raise BadScan(f"a range of {largest:g} m with `far` {far:g} m: give both in m, and `far` for no hit")
+
+
 def check_numbers(
     name: str, coordinates: Iterable[float], far: float, bounds: Iterable[float], least_width: float
 ) -> None:
@@ -158,9 +168,7 @@ class Scan(ComparedByValue):
         bounds = (self.range_error, self.position_error, self.heading_error, self.speed, self.age)
         more = (self.doubt, self.acceleration, self.least_radius)
         check_numbers("scan", (*self.pose, *self.mount), self.far, (*bounds, *more), self.least_width)
-        if (largest := float(np.nan_to_num(self.ranges).max(initial=0.0))) > BEYOND_FAR * self.far:
-            # A range beyond `far` means no hit. If ranges were in mm, all of them would mean free space.
-            raise BadScan(f"a range of {largest:g} m with `far` {self.far:g} m: give both in m, and `far` for no hit")
+        check_largest(self.ranges, self.far)
         if self.doubt != int(self.doubt):
             raise BadScan("a scan's doubt is a whole number of beams")
         object.__setattr__(self, "doubt", int(self.doubt))

@@ -95,4 +95,5 @@ def image_of(message: pb.RangeImage) -> RangeImage:
     if not message.rings or not message.ranges or len(message.ranges) % (2 * message.rings):
         raise BadScan("a range image has two bytes for each beam, and as many beams in every ring")
     ranges = np.frombuffer(message.ranges, "<u2").reshape(message.rings, -1) * RANGE_STEP
+    ranges = np.minimum(ranges, max(0.0, message.far))  # a program may send the largest number for no hit
     return RangeImage(ranges, **_values(message, IMAGE_FIELDS))

@@ -150,8 +150,8 @@ class Decision(ComparedByValue):
         outside_share: the share of windows that may leave the sets (`certify --outside`). 0 if `judges` is false.
         score: the largest ratio of an error to its set, without widening, in the request's past window. None without
             such a window, or if the model set cannot score it.
-        plan_score: the same of the errors that decide about obstacles and limits: those of positions, and of
-            coordinates with a limit. After one period, `score` counts all coordinates.
+        plan_score: the same of the errors that decide about obstacles and limits: those of positions (of all discs of
+            the body), and of coordinates with a limit. After one period, `score` counts all coordinates.
         for_clearance: whether the proposal was verified too and only came nearer than the clearance margin. None if
             unknown.
     """

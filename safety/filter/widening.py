@@ -3,8 +3,8 @@
 A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
 The largest recent score, and a tenth more, is a factor by which the filter widens sets of the next decision. The sets
-of plans follow the scores of positions alone, because only positions decide about obstacles. The set of the next state
-follows the scores of all coordinates.
+of plans follow the scores of positions (those of all discs of the body) and of coordinates with a limit alone, because
+only they decide what is verified. The set of the next state follows the scores of all coordinates.
 `certify --outside` lets a share of the windows leave their sets. So many of the largest scores do not count.
 Some model sets predict plans only, so the filter cannot score windows. Then the client scores each period itself.
 """

@@ -16,8 +16,8 @@ class WindowScore:
     """Scores windows by the sets that a model set of mode one-step states for them, without widening."""
 
     def __init__(self, model: ModelSet, one_step: OneStep) -> None:
-        n, robot = model.robot.state_dim, model.robot
-        kappa, M, w = (np.array([getattr(step, name)[:n] for step in model.steps]) for name in ("kappa", "M", "w"))
+        robot = model.robot
+        kappa, M, w = (np.array([getattr(step, name) for step in model.steps]) for name in ("kappa", "M", "w"))
         scored = np.array(scored_coordinates(robot), dtype=np.int64)
         W = np.ascontiguousarray(model.first.W)  # the same for all periods
         from brakeline.safety.filter.kernels import window_kernels

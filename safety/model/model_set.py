@@ -346,11 +346,11 @@ def extra_coordinates(robot: Robot) -> tuple[int, ...]:
 
 
 def scored_coordinates(robot: Robot) -> tuple[int, ...]:
-    """Return the coordinates that a plan must predict after every period: the position, or in joint space the limited.
+    """Return the coordinates that a plan must predict after every period: the position, and `extra_coordinates`.
 
     The other predicted coordinates count after one period only.
     """
-    return tuple(range(robot.position_dim)) or extra_coordinates(robot)
+    return (*range(robot.position_dim), *extra_coordinates(robot))
 
 
 def whitening_of(step: ErrorBound, basis: Array) -> Array:

@@ -14,7 +14,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.scan import BeamTracks, Scan
-from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
+from brakeline.messaging.sensor_messages import image_message, image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import patch_free_ranges
 from tests.messaging.test_obstacle import sample
@@ -187,12 +187,19 @@ def test_two_at_once_and_half_a_beam_are_refused():
         image_of(image)
 
 
+def test_any_range_in_a_message_beyond_far_means_no_hit():
+    message = image_message(RangeImage(np.ones((45, 90)), (0.0,) * 3, far=5.0))
+    message.ranges = b"\xff" * len(message.ranges)
+    assert (image_of(message).ranges == 5.0).all()
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
         ({"ranges": np.ones(90)}, "rings and columns"),
         ({"ranges": np.ones((1, 90))}, "at most 12°"),
         ({"ranges": np.full((45, 90), 1200, np.uint16)}, "may be in mm"),
+        ({"ranges": np.full((45, 90), 1200.0)}, "give both in m"),
         ({"doubt": 0.5}, "doubt is 0 or 1"),
         ({"ranges": np.ones((45, 12))}, "at most 12°"),
         ({"ranges": np.ones((300, 300))}, "beams at most"),

@@ -248,13 +248,16 @@ def sets_around(predictor, across, weight, T, kept, sets, more_sets, z):
 
 def score(predictor, across, weight, states, executed, W, M, kappa, w, scored):
     """`window_kernels.score`."""
-    _, _, _, _, others, heading, _, d, _ = predictor
+    _, _, _, _, others, heading, arms, d, _ = predictor
     window, after = np.concatenate([states[0, others], executed.ravel()]), states[1:].copy()
     after[:, :d] = (states[1:, :d] - states[0, :d]) @ turning(states[0, heading], d)
     after[:, heading] = np.angle(np.exp(1j * (states[1:, heading] - states[0, heading])))
+    turns = [turning(angle, d) for angle in after[:, heading]]
+    discs = [[row[:d] + turn @ arm - arm for row, turn in zip(after, turns, strict=True)] for arm in arms]
+    after = np.hstack([after, *discs])
     widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
     predicted, stretch = rollout(predictor, across, weight, window)
-    shares = np.abs(after - predicted[:, : states.shape[1]]) / (widths * stretch[:, None])
+    shares = np.abs(after - predicted) / (widths * stretch[:, None])
     of_scored = shares[:, scored].max()
     return max(of_scored, shares[0].max()), of_scored
 

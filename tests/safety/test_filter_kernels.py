@@ -140,8 +140,8 @@ def cases(rng, d):
         ),
         "score": (
             *(predictor, root.T, weight, rng.normal(size=(N + 1, d + 3)), 0.5 * rng.normal(size=(N + 1, 2))),
-            *(rng.normal(size=(Q, 2 + 2 + 2 * N)), rng.random((N, d + 3, Q))),
-            *(rng.random((N, d + 3, 2 + 2 + 2 * N)), rng.random((N, d + 3)), np.arange(d)),
+            *(rng.normal(size=(Q, 2 + 2 + 2 * N)), rng.random((N, 2 * d + 3, Q))),
+            *(rng.random((N, 2 * d + 3, 2 + 2 + 2 * N)), rng.random((N, 2 * d + 3)), np.array([*range(d), d + 3])),
         ),
         "linearized": (predictor, plan[1] @ plan[0], plan[1]),
         "distances": (*near.parts, start),

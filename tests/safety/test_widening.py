@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from brakeline.deploy.data.certification import certify
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.robot import Disc, Limit
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch
-from brakeline.safety.filter.batch.request_arrays import PredictionArrays
+from brakeline.safety.filter.batch.request_arrays import PredictionArrays, RequestArrays
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.widening import MODELS, MOST, RESERVE, WINDOWS, PastWindow, Widening, widening_factor
@@ -24,7 +26,7 @@ from brakeline.safety.service.wire import decision_of, decision_reply, request_o
 from brakeline.sim.navigation_env import NavigationEnv
 from tests.robots import GROUND
 from tests.safety.asked import cylinder
-from tests.safety.test_one_step import certified, ready, request
+from tests.safety.test_one_step import CONFIG, certified, driven, ready, request
 from tests.safety.test_turning_in_place import ROBOT, wandering
 from tests.safety.unicycle import Unicycle
 
@@ -175,6 +177,28 @@ def test_errors_of_speeds_alone_widen_the_set_of_the_next_state_and_not_those_of
     less = safety.decide(replace(ask, widening=2.0, state_widening=1.5))
     both = safety.decide(replace(ask, widening=2.0))
     assert (less.predicted.half_width == both.predicted.half_width).all(), "as much as those of plans at least"
+
+
+LONG = Disc((0.15, 0.0), 0.08), Disc((-0.15, 0.0), 0.08)
+SLOW = Limit("slow", (0.0, 0.0, 0.0, 1.0, 0.0), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "coordinate"), [({"body": LONG}, 2), ({"limits": (SLOW,)}, 3)], ids=["discs", "limit"]
+)
+def test_errors_of_what_decides_about_obstacles_and_limits_widen_the_sets_of_plans(changes, coordinate):
+    """A long robot that turns farther than predicted hits with its ends. Only its middle was scored."""
+    robot = replace(ROBOT, **changes)
+    safety = Filter(certify(replace(driven(trajectories=3), robot=robot), CONFIG)[0])
+    ask = replace(request(np.zeros(5), np.zeros(2), np.zeros(2), [], robot), known_free=True)
+    for after in (1, N - 1):  # periods
+        states = np.zeros((N, 5))
+        states[after:, coordinate] = 0.5
+        asked = replace(ask, state=states[-1], past=PastWindow(states, np.zeros((N + 1, 2))))
+        assert safety.scores(asked)[1] > 3.0
+        answers = safety.decide_batch(RequestArrays.of([asked]))
+        assert answers.plan_score[0] == pytest.approx(safety.scores(asked)[1])
+        assert bool(answers.singly) == bool(robot.limits)
 
 
 def test_a_service_that_does_not_score_plans_apart_widens_them_by_the_whole_score():

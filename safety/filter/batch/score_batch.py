@@ -16,10 +16,11 @@ class ScoreBatch:
     """Scores windows by the sets that a model set of mode one-step states for them, without widening."""
 
     def __init__(self, model: ModelSet, rollout: RolloutBatch, constant: Any, xp: Any) -> None:
-        n, robot = model.robot.state_dim, model.robot
-        self._xp, self._rollout, self._n, self._d = xp, rollout, n, robot.position_dim
+        robot = model.robot
+        self._xp, self._rollout, self._n, self._d = xp, rollout, robot.state_dim, robot.position_dim
         self._heading, self._regressor = robot.heading, list(robot.regressor)
-        kappa, M, w = (np.array([getattr(step, name)[:n] for step in model.steps]) for name in ("kappa", "M", "w"))
+        self._arms = [disc.at for disc in robot.body if disc.arm > 0.0]
+        kappa, M, w = (np.array([getattr(step, name) for step in model.steps]) for name in ("kappa", "M", "w"))
         self._W, self._M, self._kappa = (
             constant(model.first.W),
             constant(M.reshape(-1, M.shape[2])),
@@ -36,23 +37,26 @@ class ScoreBatch:
 
         states (N, n, B), inputs (N + 1, m, B): of the past periods. state (n, B): measured now.
         """
-        xp, n, d = self._xp, self._n, self._d
-        N, first = states.shape[0], states[0]
+        xp, n, d, first = self._xp, self._n, self._d, states[0]
         speeds = xp.stack([first[i] for i in self._regressor])
         window = xp.concat([speeds, xp.reshape(inputs, (-1, inputs.shape[2]))])
-        outputs, stretch = self._rollout.windows(window)
-        predicted = outputs[:, :n]
+        predicted, stretch = self._rollout.windows(window)  # (N, n + d·discs, B)
         after = xp.concat([states[1:], state[None]])
         moved = [after[:, i] - first[i] if i < d else after[:, i] for i in range(n)]
         if self._heading is not None:
             moved = TurnBatch(xp.cos(first[self._heading]), xp.sin(first[self._heading])).to_robot(moved)
             turned = moved[self._heading] - first[self._heading]
-            moved[self._heading] = xp.remainder(turned + math.pi, math.tau) - math.pi
+            turned = moved[self._heading] = xp.remainder(turned + math.pi, math.tau) - math.pi
+            turn = TurnBatch(xp.cos(turned), xp.sin(turned))
+            for at in self._arms:
+                swung = turn.to_world([*at])
+                moved += [moved[axis] + swung[axis] - at[axis] for axis in range(d)]
         off = xp.abs(xp.stack(moved, axis=1) - predicted)
+        N, count = off.shape[:2]
         width = self._M @ xp.abs(self._W @ window) + self._kappa @ xp.abs(window)
-        width = (xp.reshape(width, (N, n, -1)) + self._w) * stretch[:, None]
+        width = (xp.reshape(width, (N, count, -1)) + self._w) * stretch[:, None]
         share = xp.where(off != 0.0, off / width, 0.0)
         score, of_plan = (
-            xp.max(xp.reshape(xp.where(counts > 0.0, share, 0.0), (N * n, -1)), axis=0) for counts in self._counts
+            xp.max(xp.reshape(xp.where(counts > 0.0, share, 0.0), (N * count, -1)), axis=0) for counts in self._counts
         )
         return score, xp.where(xp.isnan(score), score, of_plan)

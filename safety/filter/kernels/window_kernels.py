@@ -33,11 +33,12 @@ def score(
 
     Args:
         states (N + 1, n): measured states. executed (N + 1, m): the input in force before, and the inputs.
-        W (q, nz), M (N, n, q), kappa (N, n, nz), w (N, n): the sets' half-widths, M |W z| + kappa |z| + w.
+        W (q, nz), M (N, c, q), kappa (N, c, nz), w (N, c): the half-widths, M |W z| + kappa |z| + w, of the sets of
+            the c = n + D·d outputs of a rollout.
         scored: indices of the coordinates that count after every period. After the first, all count.
     """
-    _, _, _, _, others, heading, _, d, _ = predictor
-    r = len(others)
+    _, _, _, _, others, heading, arms, d, _ = predictor
+    r, n = len(others), states.shape[1]
     window = np.empty(r + executed.size)
     for i in range(r):
         window[i] = states[0, others[i]]
@@ -47,16 +48,22 @@ def score(
     for i in range(len(W)):
         for j in range(len(window)):
             atoms[i] += W[i, j] * window[j]
-    atoms = np.abs(atoms)
+    atoms, after = np.abs(atoms), np.empty(w.shape[1])
     cos, sin = (math.cos(first[heading]), math.sin(first[heading])) if heading >= 0 else (1.0, 0.0)
     for k in range(len(w)):
-        after = states[k + 1].copy()
+        after[:n] = states[k + 1]
         for axis in range(d):
             after[axis] -= first[axis]
         if heading >= 0:
             east, north = after[0], after[1]
             after[0], after[1] = cos * east + sin * north, cos * north - sin * east
             after[heading] = (after[heading] - first[heading] + math.pi) % math.tau - math.pi
+            ahead, aside = math.cos(after[heading]), math.sin(after[heading])
+            for j in range(len(arms)):
+                at = n + j * d
+                after[at : at + d] = after[:d]
+                after[at] += ahead * arms[j, 0] - aside * arms[j, 1] - arms[j, 0]
+                after[at + 1] += aside * arms[j, 0] + ahead * arms[j, 1] - arms[j, 1]
         for at in range(len(after) if k == 0 else len(scored)):
             i = at if k == 0 else scored[at]
             off, width = abs(after[i] - predicted[k, i]), w[k, i]
