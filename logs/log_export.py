@@ -8,6 +8,7 @@ import re
 import struct
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -15,20 +16,43 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from brakeline.errors import ExportError
+from brakeline.errors import ExportError, UnknownRobot
 from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.reader import Log, Record
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import whole_or_nothing
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 BATCH = 1000  # messages per write
 EPISODES_AT_ONCE = 100  # episodes per write of a Minari data set
 # Fields of a step in the `infos` of a Minari data set.
 INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weights_version")
 TIME = struct.Struct(">Q")  # of a frame in a .tlog file: µs since the Unix epoch
+
+
+def robot_of_log(log: Log, name: str) -> Robot:
+    """Return the robot with this name or description file. A robot of one's own needs only the log, which describes it.
+
+    Args:
+        name: if it is empty, the only robot with steps in the log; of several the ground robot.
+
+    Raises:
+        UnknownRobot: neither the program nor the log describes it.
+        ExportError: the log has steps of several robots but no name was given.
+        LogError: as `Log`.
+    """
+    if name:
+        with suppress(UnknownRobot):
+            return robot_maybe_with_task(name)
+    whole = Log(log.paths)
+    names = {channel.robot for channel, *_ in whole.rows() if channel.topic == "step"}
+    wanted = name or (next(iter(names)) if len(names) == 1 else "ground")
+    if not name and names and wanted not in names:
+        raise ExportError(f"the log has steps of {', '.join(sorted(names))}: give --robot NAME")
+    robot = whole.robots.named(wanted)
+    return robot if robot is not None else robot_maybe_with_task(wanted)
 
 
 def robot_steps(log: Log, robot: Robot) -> Iterator[Record]:
@@ -47,7 +71,7 @@ def robot_steps(log: Log, robot: Robot) -> Iterator[Record]:
             others.add(record.message.robot)
     if empty and others:
         names = ", ".join(sorted(others))
-        advice = "give --robot NAME or the path of its description"
+        advice = "give one of these names with --robot"
         raise ExportError(f"the log has no step of {robot.name}, but steps of {names}: {advice}")
     if empty:
         raise ExportError(f"the log has no step of {robot.name} or of any other robot")

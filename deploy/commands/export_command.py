@@ -11,7 +11,7 @@ from brakeline.deploy.commands.command_output import print_damage, print_result
 from brakeline.deploy.commands.common_options import LATEST, Json, Logs, Quiet
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.atomic_files import whole_or_nothing
-from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
+from brakeline.messaging.task import needs_task
 
 if TYPE_CHECKING:
     from brakeline.logs.reader import Log
@@ -30,8 +30,9 @@ class ExportCommand:
     """Write an MCAP file with a picture of each step. The log itself has pictures of some steps."""
     tlog: Path | None = None
     """Write each MAVLink frame to this file, which ground stations and pymavlink can read."""
-    robot: str = "ground"
-    """With --csv and --minari, export the steps of this robot. Give its name, or the path of a description (.toml)."""
+    robot: str = ""
+    """With --csv and --minari, export the steps of this robot. Give its name, or the path of a description (.toml).
+    Defaults to the only robot of the log; if it has several, to ground."""
     quiet: Quiet = False
     json: Json = False
 
@@ -62,16 +63,16 @@ class ExportCommand:
         return 0
 
     def _csv(self, log: Log, out: Path) -> dict[str, Any]:
-        from brakeline.logs.log_export import to_csv
+        from brakeline.logs.log_export import robot_of_log, to_csv
 
-        robot = robot_maybe_with_task(self.robot)
+        robot = robot_of_log(log, self.robot)
         with whole_or_nothing(out) as path, path.open("w", newline="") as file:
             return {"path": str(out), "steps": to_csv(log, robot, file)}
 
     def _minari(self, log: Log, name: str) -> dict[str, Any]:
-        from brakeline.logs.log_export import to_minari
+        from brakeline.logs.log_export import robot_of_log, to_minari
 
-        return to_minari(log, robot_with_task(self.robot), name)
+        return to_minari(log, needs_task(robot_of_log(log, self.robot)), name)
 
     def _foxglove(self, log: Log, out: Path) -> dict[str, Any]:
         from brakeline.logs.log_export import to_foxglove

@@ -66,6 +66,16 @@ class AlignedLog:
         i = i[self.time[i + n] - self.time[i] <= 1.5 * n * self.step]
         return i, i + n
 
+    def input_spans(self) -> tuple[Indices, Indices]:
+        """Return the row indices of all pairs between which an input changes as much as in one period.
+
+        If the period is the beat, it changes once, which one row shows. With uneven stamps, the rows of a period may
+        hold two changes.
+        """
+        beat = self.beat() if self.step < 0.75 * self.period else None
+        once = beat is not None and abs(self.period / beat.seconds - 1.0) < 1e-6
+        return self.rows_apart(1) if once else self.spans(self.period)
+
     def change(self, name: str, i: Indices, j: Indices) -> Array:
         """Return the change of a column from rows i to rows j."""
         return self.columns[name][j] - self.columns[name][i]

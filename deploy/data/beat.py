@@ -52,7 +52,7 @@ def find_beat(between: Array, step: float) -> Beat | None:
         return None
     last = int(np.flatnonzero(coherence >= AS_COHERENT * best)[-1])
     around = slice(max(last - 20, 0), last + 1)
-    seconds = _refined(times, float(steps[around][coherence[around].argmax()]))
+    seconds = _refined(times, float(steps[around][coherence[around].argmax()]), step)
     away = np.abs(between / seconds - np.round(between / seconds))
     return Beat(seconds, float(np.mean((away <= NEAR) & (between > 0.5 * seconds))), len(between))
 
@@ -66,8 +66,18 @@ def _coherence(times: Array, step: float) -> float:
     return coherence if coherence > max(LEAST_COHERENCE, LEAST_SIGMAS * math.sqrt(0.5 / len(near))) else -1.0
 
 
-def _refined(times: Array, seconds: float) -> float:
-    """Return the step that fits the times best (least squares), from a first guess."""
-    multiples = np.round(times / seconds)
-    near = (multiples >= 1.0) & (multiples <= MOST_BEATS) & (np.abs(times / seconds - multiples) <= NEAR)
-    return float(times[near] @ multiples[near] / (multiples[near] @ multiples[near])) if near.any() else seconds
+def _refined(times: Array, seconds: float, step: float) -> float:
+    """Return the step that fits the times best (least squares), from a first guess.
+
+    If a row is long beside the beat, the times are multiples of the row, and those near multiples of a guess confirm
+    it. Then every time counts, the shortest ones first, because a wrong guess counts too many beats in the others.
+    """
+    if step < NEAR * seconds:
+        multiples = np.round(times / seconds)
+        near = (multiples >= 1.0) & (multiples <= MOST_BEATS) & (np.abs(times / seconds - multiples) <= NEAR)
+        return float(times[near] @ multiples[near] / (multiples[near] @ multiples[near])) if near.any() else seconds
+    for most in range(1, MOST_BEATS + 1):
+        multiples = np.round(times / seconds)
+        near = (multiples >= 1.0) & (multiples <= most)
+        seconds = float(times[near] @ multiples[near] / (multiples[near] @ multiples[near])) if near.any() else seconds
+    return seconds

@@ -217,7 +217,7 @@ def _states(log: AlignedLog, others: Sequence[str], pairs: dict[str, str]) -> li
 
 
 def _inputs(log: AlignedLog) -> list[InferredColumn]:
-    spans = log.spans(log.period)
+    spans = log.input_spans()
     most = {n: float(np.abs(log.change(n, *spans)).max()) for n in log.inputs}  # changes over one period
     return [_column(log, n, name=_plain(n, log), change=most[n], moves=moves_alone(log, n)) for n in log.inputs]
 

@@ -59,13 +59,18 @@ def test_csv_of_a_robot_without_a_task_has_all_but_observations(tmp_path, comman
         "action": [0.2] * robot.action_dim,
     }
     steps = [pb.Step(**about, step=i, index=i + 1, state=[0.5 * i] * robot.state_dim) for i in range(3)]
-    written(tmp_path / "run.mcap", ((f"step/{robot.name}/a", step, 1 + i) for i, step in enumerate(steps)))
-    status, _, err = command("export", tmp_path, "--csv", tmp_path / "steps.csv", "--robot", FILE)
-    assert status == 0, err
-    with (tmp_path / "steps.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [[float(row[f"state.{part}"]) for part in robot.state] for row in rows] == [list(s.state) for s in steps]
-    assert not any(name.startswith("observation") for name in rows[0])
+    described = {"robots": {robot.name: json.dumps(robot.description)}}
+    written(tmp_path / "run.mcap", ((f"step/{robot.name}/a", step, 1 + i) for i, step in enumerate(steps)), described)
+    for words in ((), ("--robot", robot.name), ("--robot", FILE)):  # the log says what its only robot is
+        status, _, err = command("export", tmp_path, "--csv", tmp_path / "steps.csv", *words)
+        assert status == 0, err
+        with (tmp_path / "steps.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert [[float(row[f"state.{part}"]) for part in robot.state] for row in rows] == [list(s.state) for s in steps]
+        assert not any(name.startswith("observation") for name in rows[0])
+    for words, said in (("nobody", "no robot is called 'nobody'"), ("ground", f"steps of {robot.name}")):
+        status, _, err = command("export", tmp_path, "--csv", tmp_path / "no.csv", "--robot", words)
+        assert status == 1 and said in err
 
 
 @pytest.mark.parametrize("words", [("export", "--csv"), ("export", "--tlog"), ("analyse", "--html")])
@@ -164,7 +169,7 @@ def test_an_impossible_export_fails_with_a_reason(log, tmp_path, command) -> Non
     for words, said in (
         ((log,), "--csv, --minari, --foxglove"),
         ((tmp_path, "--csv", tmp_path / "a.csv"), "no log"),
-        ((log, "--csv", tmp_path / "q.csv", "--robot", "quadrotor"), "but steps of ground: give --robot NAME"),
+        ((log, "--csv", tmp_path / "q.csv", "--robot", "quadrotor"), "but steps of ground: give one of these names"),
     ):
         status, _, err = command("export", *words)
         assert status == 1 and said in err

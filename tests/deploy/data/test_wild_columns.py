@@ -330,6 +330,25 @@ def test_the_period_is_the_beat_of_a_stick_that_is_held(tmp_path, capsys):
     assert sure and int(sure[1]) > 95 and int(sure[2]) > 30
 
 
+def test_uneven_rows_show_the_beat_and_the_slew_of_a_controller(tmp_path, capsys):
+    """Rows every 0.035 s, some late, of a stick that moves by 0.05 m/s and 0.2 rad/s at most, each 0.1 s."""
+    rng = np.random.default_rng(1)
+    robot, u, target, slew = Porter(rng), np.zeros(2), np.zeros(2), np.array([0.05, 0.2])
+    times, values, due = [], [], 0.0
+    for k in range(20_000):
+        if k % 10 == 0:
+            target = np.where(rng.random() < 0.05, rng.choice([0.0, 0.3, 0.6], 2) * [1.0, rng.choice([-2, 2])], target)
+            u = u + np.clip(target - u, -slew, slew)
+        if 0.01 * k >= due:
+            times.append(0.01 * k + rng.uniform(0.0, 0.003))
+            values.append([*robot.measured(), *u])
+            due = 0.01 * k + rng.choice([0.03, 0.04], p=[0.55, 0.45]) + 0.01 * (rng.random() < 0.15)
+        robot.step(u, 0.01)
+    robot, _ = described(write_csv(tmp_path / "uneven.csv", np.array(times), np.array(values)))
+    assert robot.period == pytest.approx(0.1, rel=5e-3)
+    assert robot.slew == pytest.approx(slew, rel=1e-6)
+
+
 def test_inputs_that_change_at_any_time_have_no_beat(tmp_path, capsys):
     time, values = held()
     rng = np.random.default_rng(2)
