@@ -23,24 +23,30 @@ TIME, X, Y, HEADING = range(4)  # columns of a row; speed [m/s] and turn rate [r
 
 @dataclass(frozen=True)
 class StepLimits:
-    """The largest step between two odometries: rates in m/s and rad/s, plus an allowance in m and rad for errors."""
+    """The largest step between two odometries: rates in m/s and rad/s, plus an allowance in m and rad for errors.
+
+    Without odometry a robot brakes. So it moves for `braking` seconds at most, however long a gap is: a pose farther
+    away comes from a sender that has restarted meanwhile.
+    """
 
     speed: float
     turn_rate: float
     position: float
     heading: float
+    braking: float
 
     @staticmethod
-    def of(robot: Robot) -> StepLimits:
-        """Return the limits of a robot that drives in the plane by speed and turn rate."""
+    def of(robot: Robot, gap: float = LONGEST_GAP) -> StepLimits:
+        """Return the limits of a robot that drives in the plane by speed and turn rate. gap: see `OdometryHistory`."""
         speed, turn_rate = (FASTER * float(most) for most in np.maximum(np.abs(robot.low()), np.abs(robot.high())))
         x, y, heading = (LARGER_ERRORS * robot.measurement_bound[i] for i in range(3))
-        return StepLimits(speed, turn_rate, math.hypot(x, y), heading)
+        return StepLimits(speed, turn_rate, math.hypot(x, y), heading, gap + (robot.horizon + 1) * robot.period)
 
     def allow(self, duration: float, distance: float, turn: float) -> bool:
         """Return whether a robot can move so far [m], and turn so far [rad], in a time [s]."""
-        far = distance > self.position + self.speed * duration
-        return not (far or turn > self.heading + self.turn_rate * duration)
+        moving = min(duration, self.braking)
+        far = distance > self.position + self.speed * moving
+        return not (far or turn > self.heading + self.turn_rate * moving)
 
 
 class OdometryHistory:

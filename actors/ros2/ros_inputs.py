@@ -160,7 +160,7 @@ class RosInputs:
         return command
 
     def _no_odometry(self) -> OdometryHistory:
-        return OdometryHistory(StepLimits.of(self.robot), self.limits.odometry)
+        return OdometryHistory(StepLimits.of(self.robot, self.limits.odometry), self.limits.odometry)
 
     def _check_jump(self) -> None:
         if why := self._odometry.jump:

@@ -137,7 +137,7 @@ class VisibilityMemory(ABC, Generic[S]):
         """Return which points (..., d) are in the ring that is free at the start; step [m]: between two points."""
         assert self._first is not None
         moved = scan is not self._first
-        drift = 2.0 * scan.position_error * moved + scan.speed * self._since_start + step
+        drift = (self._first.position_error + scan.position_error) * moved + scan.speed * self._since_start + step
         return np.asarray(np.linalg.norm(points - _position(self._first), axis=-1) <= self._start_radius - drift)
 
 

@@ -118,6 +118,14 @@ def test_at_the_start_only_a_ring_around_the_body_is_free_and_only_if_the_first_
     assert not memory.fill(BLINDED, 0.2).valid_beams.any()
 
 
+def test_the_place_of_the_start_has_the_error_of_the_first_pose():
+    """A later pose may be known better, as after the odometry's drift is added to a late scan's error."""
+    first, memory = replace(empty(), position_error=0.08), FanMemory(0.105)
+    memory.fill(first, 0.2)
+    behind = memory.fill(replace(empty(), position_error=0.0), 0.2).ranges[BEHIND] - first.range_error
+    assert (behind <= 0.125 + 1e-9).all() and (behind > 0.1).all()
+
+
 def test_an_episode_that_begins_without_a_scan_frees_nothing_if_the_robot_has_a_sensor():
     memory = memory_of(GROUND)
     assert filled_from_memory(memory, {}, 0.2) is None, "no scan has ever come"

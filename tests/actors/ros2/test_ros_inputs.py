@@ -188,11 +188,23 @@ def test_a_step_that_the_robot_cannot_do_is_said_once_and_begins_a_new_history(x
 def test_what_a_robot_can_do_is_no_jump():
     """Neither are a gap, a late stamp, and errors of the measurement."""
     history = OdometryHistory(LIMITS)
-    for time, x, heading in ((0.0, 0.0, 3.1), (0.02, 0.02, -3.12), (0.021, 0.005, 3.1), (4.0, 1.5, 0.5)):
+    for time, x, heading in ((0.0, 0.0, 3.1), (0.02, 0.02, -3.12), (0.021, 0.005, 3.1), (4.0, 0.4, 2.5)):
         history.add(time, x, 0.0, heading, 0.2, 0.0)
         assert history.newest == time and history.jump == ""
-    history.add(1.0, 1.5, 0.0, 0.5, 0.2, 0.0)
+    history.add(1.0, 0.4, 0.0, 2.5, 0.2, 0.0)
     assert history.newest == 1.0 and history.jump == "the time of the odometry went back by 3.00 s"
+
+
+@pytest.mark.parametrize("gap", [2.0, 60.0])
+@pytest.mark.parametrize(("x", "heading"), [(0.8, 0.0), (0.0, 1.5)])
+def test_a_robot_brakes_in_a_gap_so_a_pose_that_is_far_away_after_it_is_a_jump(gap, x, heading):
+    """As after a restart of what sends the odometry. Space stated as free before stayed free, elsewhere."""
+    inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose(), free_at_start=0.5), AgeLimits())
+    for i in range(3):
+        inputs.on_odometry(odometry(9.9 + 0.05 * i, 0.01 * i, 0.2))
+    inputs.on_odometry(odometry(10.0 + gap, x, 0.0, heading))
+    with pytest.raises(PoseJumped, match=rf"the pose jumped by .* within {gap:.2f} s"):
+        inputs.state(10.0 + gap, 10.0 + gap)
 
 
 def test_odometry_in_another_frame_is_refused_and_both_are_named():
