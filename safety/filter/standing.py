@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from brakeline.messaging.robot import Array, Robot
@@ -21,7 +23,8 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
 
     The first request of a program contains no prediction, and the robot may be driving already. Then the robot counts
     as standing only if the sets of its plan contain its present position in every period, up to the measurement error.
-    In joint space, this is about the coordinates that have a limit.
+    In joint space, this is about the coordinates that have a limit. A later request contains the predicted set of the
+    state. If it was widened, a robot outside the set without widening does not stand: something pushes it.
 
     Args:
         z: regressors of the plan.
@@ -29,8 +32,12 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
             robot does not stand because its sets were widened.
     """
     robot = constraints.robot
-    if not request.still(robot) or request.predicted is not None:
-        return request.still(robot)
+    if not request.still(robot):
+        return False
+    if (predicted := request.predicted) is not None:
+        factor = local_map.state_widening / (start if request.past is None else 1.0)
+        stated = replace(predicted, half_width=predicted.half_width / factor)
+        return factor <= 1.0 or stated.contains(robot, request.state)
     constraints = constraints.at(z, start)
     if robot.position_dim:
         centers, half = constraints.sets(local_map.start, local_map.turn, z)

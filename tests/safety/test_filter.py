@@ -63,6 +63,19 @@ def test_nothing_is_verified_before_the_input_in_force_of_a_robot_that_flies_is_
         assert client.decide(flies, first[0].action, known_free=True).kind == kind
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.1, 0.2])  # m/s
+def test_a_robot_that_rolls_does_not_stand_because_its_sets_were_widened(speed):
+    """It rolled 0.8 m and hit the wall, and all the way its plan to stand was verified, in sets 150 times as wide."""
+    client, state, answers = InProcess(Filter.load("ground")), np.zeros(5), []
+    wall = [Obstacle("wall", (0.9, 0.0), yaw=np.pi)]
+    for _ in range(40):
+        answers.append(client.decide(state, [np.nan, 0.0], wall))
+        state = np.array([state[0] + speed * GROUND.period, 0.0, 0.0, speed, 0.0])
+    beyond = [answer.margin < 0.0 for answer in answers]
+    assert any(beyond) == (speed > 0.0)
+    assert [answer.verified for answer in answers] == [not crossed for crossed in beyond]
+
+
 @pytest.mark.parametrize("way", [0.28, 0.35, 0.45, 0.7])
 def test_the_margin_is_the_distance_to_the_obstacle_even_beyond_the_reach(model, ready, way):
     ask = request(obstacles=[cylinder(way, 0.0)])
