@@ -222,6 +222,16 @@ def test_certify_refuses_options_that_would_do_nothing(command, few_data, words,
     assert status == 1 and said in " ".join(err.split())
 
 
+def test_certify_says_with_which_options_commands_load_a_model_set(command, few_data, tmp_path, monkeypatch):
+    """Without them, they load another one: the line sounded as if it were this one."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "my data"))
+    words = ("certify", "--data", few_data, "--certificates", "residual", "--accept-bound", 1, "--use", "--mode")
+    status, page, err = command(*words, "recursion")
+    assert status == 0 and "in use from now on by commands with --mode recursion; without that, they load" in page, err
+    status, page, err = command(*words, "direct")
+    assert status == 0 and "residual-direct.safetensors: in use from now on\n" in page, err
+
+
 def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(
     command, figures, few_data, monkeypatch
 ):
