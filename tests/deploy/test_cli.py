@@ -76,6 +76,8 @@ STATED = {
         ("import", "there is no log to import"),
         ("compare ground --table --results {folder}/none", "none: there are no results of ground"),
         ("robot new {folder}/none/my.toml", "none/my.toml': make the folder"),
+        ("robot check ground --map v=speed", "--from, --map, --unit and --topics are for `robot new`, not for check"),
+        ("robot new {folder}/my.toml --unit v=km/h", "--unit v=km/h: these options are for reading a log; name it"),
         ("certify --data {folder}/none.mcap", "no log at"),
         ("certify --data nothere.safetensors", "no data set at nothere.safetensors"),  # it is not recorded anew
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
@@ -373,6 +375,15 @@ def test_every_method_of_the_service_can_be_chosen_and_named_in_a_configuration(
 
 
 # --- `brakeline robot` -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [("{log}", "{csv}"), ("{csv}", "{log}"), ("{log}", "--unit", "v=km/h")])
+def test_a_new_description_from_a_run_takes_nothing_else(command, log, tmp_path, words):
+    """The second log and the options were ignored in silence."""
+    drive_csv = write_csv(tmp_path / "drive.csv", *drive(seconds=10.0))
+    places = (word.format(log=log, csv=drive_csv) for word in words)
+    status, _, err = command("robot", "new", tmp_path / "my.toml", "--from", *places)
+    assert status == 1 and "give one such log alone, without --map" in err and not (tmp_path / "my.toml").exists()
 
 
 def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, figures, tmp_path):
