@@ -222,7 +222,11 @@ def run_folder(given: Path | None) -> Iterator[Path]:
         yield folder
     finally:
         if given is None:
+            from brakeline.deploy.run.run_lock import LOCK
+
             with suppress(OSError):  # it holds a run
+                if [file.name for file in folder.iterdir()] == [LOCK]:
+                    (folder / LOCK).unlink()
                 folder.rmdir()
 
 
