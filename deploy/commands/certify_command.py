@@ -98,7 +98,7 @@ class CertifyCommand:
                 if "in_use" not in row:
                     continue
                 console.print(f"{row['in_use']}: in use from now on{only_with(kind, mode)}", markup=False)
-                if self.accept_bound is not None:
+                if refusal(data.robot, {"bound_plan": str(row["bound_plan"])}):
                     console.print(
                         "other commands refuse this model set unless you give them the same --accept-bound",
                         markup=False,

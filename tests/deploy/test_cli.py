@@ -17,6 +17,7 @@ from rich.console import Console
 from brakeline import Filter, InProcess
 from brakeline.deploy import progress
 from brakeline.deploy.cli import COMMANDS, command_class, main, reason
+from brakeline.deploy.commands import certify_command
 from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
@@ -230,8 +231,11 @@ def test_certify_says_with_which_options_commands_load_a_model_set(command, few_
     words = ("certify", "--data", few_data, "--certificates", "residual", "--accept-bound", 1, "--use", "--mode")
     status, page, err = command(*words, "recursion")
     assert status == 0 and "in use from now on by commands with --mode recursion; without that, they load" in page, err
+    assert "other commands refuse this model set unless" in page, "its bound is above the robot's own limit"
+    monkeypatch.setattr(certify_command, "refusal", lambda *_: "")
     status, page, err = command(*words, "direct")
     assert status == 0 and "residual-direct.safetensors: in use from now on\n" in page, err
+    assert "other commands refuse" not in page, "a larger --accept-bound than needed changes nothing"
 
 
 def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(
