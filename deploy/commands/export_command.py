@@ -62,16 +62,21 @@ class ExportCommand:
         return 0
 
     def _csv(self, log: Log, out: Path) -> dict[str, Any]:
+        from brakeline.deploy.data.run_dataset import check_logs
         from brakeline.logs.log_export import to_csv
 
         robot = robot_maybe_with_task(self.robot)
+        check_logs(self.logs, robot)  # which names the columns
         with whole_or_nothing(out) as path, path.open("w", newline="") as file:
             return {"path": str(out), "steps": to_csv(log, robot, file)}
 
     def _minari(self, log: Log, name: str) -> dict[str, Any]:
+        from brakeline.deploy.data.run_dataset import check_logs
         from brakeline.logs.log_export import to_minari
 
-        return to_minari(log, robot_with_task(self.robot), name)
+        robot = robot_with_task(self.robot)
+        check_logs(self.logs, robot)
+        return to_minari(log, robot, name)
 
     def _foxglove(self, log: Log, out: Path) -> dict[str, Any]:
         from brakeline.logs.log_export import to_foxglove
