@@ -18,7 +18,7 @@ from brakeline.errors import Unsupported
 from brakeline.logs.stacking_table import StackingTable
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.model.model_config import KINDS, MODES, ONE_STEP, RESIDUAL, ModelConfig
+from brakeline.safety.model.model_config import KINDS, MODES, ONE_STEP, RECURSION, RESIDUAL, ModelConfig
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
 
 if TYPE_CHECKING:
@@ -94,9 +94,11 @@ class CertifyCommand:
         else:
             self._print(models, notes, data)
             console.print(f"{path}: {note}", markup=False)
-            for row in (row for modes in results.values() for row in modes.values() if "in_use" in row):
-                console.print(f"{row['in_use']}: in use from now on", markup=False)
-                if self.accept_bound is not None:
+            for kind, mode, row in ((k, m, row) for k, modes in results.items() for m, row in modes.items()):
+                if "in_use" not in row:
+                    continue
+                console.print(f"{row['in_use']}: in use from now on{only_with(kind, mode)}", markup=False)
+                if refusal(data.robot, {"bound_plan": str(row["bound_plan"])}):
                     console.print(
                         "other commands refuse this model set unless you give them the same --accept-bound",
                         markup=False,
@@ -233,6 +235,12 @@ class CertifyCommand:
                 message.file, message.claim, message.signature = signed.file, signed.claim, signed.signature
             bus.publisher(MODEL, robot=model.robot.name).put(message)
         errors.print(f"published {model.model_config.certificate} {model.version} for {model.robot.name}")
+
+
+def only_with(certificate: str, mode: str) -> str:
+    """Say which options the commands need that are to load a model set in use; empty if they load it without any."""
+    words = [f"--certificate {certificate}"] * (certificate != RESIDUAL) + [f"--mode {mode}"] * (mode == RECURSION)
+    return f" by commands with {' '.join(words)}; without that, they load another one" if words else ""
 
 
 def widening(report: ValidationReport) -> str:

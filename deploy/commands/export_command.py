@@ -15,6 +15,7 @@ from brakeline.messaging.task import needs_task
 
 if TYPE_CHECKING:
     from brakeline.logs.reader import Log
+    from brakeline.messaging.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -62,17 +63,26 @@ class ExportCommand:
         print_result(self.json, figures | asdict(damage), *(f"{path}: {text}" for path, text in counts.items()))
         return 0
 
-    def _csv(self, log: Log, out: Path) -> dict[str, Any]:
-        from brakeline.logs.log_export import robot_of_log, to_csv
+    def _robot_of(self, log: Log) -> Robot:
+        """Return the robot whose steps are exported. Raises BadData if its description names other columns."""
+        from brakeline.deploy.data.run_dataset import check_logs
+        from brakeline.logs.log_export import robot_of_log
 
         robot = robot_of_log(log, self.robot)
+        check_logs(self.logs, robot)
+        return robot
+
+    def _csv(self, log: Log, out: Path) -> dict[str, Any]:
+        from brakeline.logs.log_export import to_csv
+
+        robot = self._robot_of(log)
         with whole_or_nothing(out) as path, path.open("w", newline="") as file:
             return {"path": str(out), "steps": to_csv(log, robot, file)}
 
     def _minari(self, log: Log, name: str) -> dict[str, Any]:
-        from brakeline.logs.log_export import robot_of_log, to_minari
+        from brakeline.logs.log_export import to_minari
 
-        return to_minari(log, needs_task(robot_of_log(log, self.robot)), name)
+        return to_minari(log, needs_task(self._robot_of(log)), name)
 
     def _foxglove(self, log: Log, out: Path) -> dict[str, Any]:
         from brakeline.logs.log_export import to_foxglove

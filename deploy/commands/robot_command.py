@@ -53,7 +53,16 @@ class RobotCommand:
     json: Json = False
 
     def run(self) -> int:
-        """Do the action. Returns the exit status; 1 if the description has mistakes."""
+        """Do the action. Returns the exit status; 1 if the description has mistakes.
+
+        Raises:
+            ValueError: an option would do nothing.
+        """
+        words = self.reading.options(self.map).words()
+        if self.action != "new" and (self.from_ or words):
+            raise ValueError(f"--from, --map, --unit and --topics are for `robot new`, not for {self.action}")
+        if words and not self.from_:
+            raise ValueError(f"{words}: these options are for reading a log; name it with --from")
         return {"new": self._new, "check": self._check, "show": self._show}[self.action]()
 
     def _new(self) -> int:
@@ -181,7 +190,12 @@ def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: Log
     from brakeline.deploy.data.importer import own_log, tables_of
     from brakeline.deploy.data.schema_inference import infer_schema, without_inputs
 
-    if own_log(sources[0]):
+    if any(map(own_log, sources)):
+        if len(sources) > 1 or options.words():
+            raise NoSource(
+                "the log of a run contains the whole description: give one such log alone, without --map, --unit and "
+                "--topics"
+            )
         return read_embedded_description(sources[0], name), ()
     names = ", ".join(source.name for source in sources)
     schema = infer_schema(*(tables_of(source, options) for source in sources), options=options)

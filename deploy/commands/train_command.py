@@ -155,11 +155,12 @@ class TrainCommand(RunConfig):
         """Run the training. Returns the exit status."""
         config = self.config()
         if config.from_logs:
-            from brakeline.deploy.run.log_feed import check_logs
+            from brakeline.deploy.data.run_dataset import check_logs
+            from brakeline.deploy.run.log_feed import SCALES
             from brakeline.messaging.task import robot_with_task
 
             for name in config.robots:  # a mistyped path ends the command before it starts a process
-                check_logs(config.from_logs, robot_with_task(name))
+                check_logs(config.from_logs, robot_with_task(name), SCALES)
         with run_folder(self.resume or self.out) as folder:
             return train(config, folder, self.resume is not None, self.bus, self.json, self.verbose, self.watch)
 
@@ -222,7 +223,11 @@ def run_folder(given: Path | None) -> Iterator[Path]:
         yield folder
     finally:
         if given is None:
+            from brakeline.deploy.run.run_lock import LOCK
+
             with suppress(OSError):  # it holds a run
+                if [file.name for file in folder.iterdir()] == [LOCK]:
+                    (folder / LOCK).unlink()
                 folder.rmdir()
 
 

@@ -296,7 +296,10 @@ def _remedy(robot: Robot, regime: str) -> str:
 
 
 def draw_coverage(data: Dataset, covered: Coverage, path: Path) -> None:
-    """Plot the driven paths, and each input against its follower with its bounds, into the image `path`."""
+    """Plot the driven paths, and each input against its follower with its bounds, into the image `path`.
+
+    In joint space, there is the second coordinate against the first one; a single coordinate is drawn over the time.
+    """
     from matplotlib.figure import Figure
 
     robot = data.robot
@@ -305,9 +308,12 @@ def draw_coverage(data: Dataset, covered: Coverage, path: Path) -> None:
     figure = Figure(figsize=(4.2 * panels, 4.4), layout="constrained")
     axes = figure.subplots(1, panels)
     for t in data.trajectories:
-        axes[0].plot(t.states[:, 0], t.states[:, 1], linewidth=0.7)
-    axes[0].set_aspect("equal", adjustable="datalim")
-    axes[0].set(xlabel=robot.state[0], ylabel=robot.state[1])
+        along = [robot.period * np.arange(len(t.states)), *t.states.T]
+        axes[0].plot(*(along[1:3] if robot.state_dim > 1 else along), linewidth=0.7)
+    if robot.position_dim:
+        axes[0].set_aspect("equal", adjustable="datalim")
+    names = robot.state[:2] if robot.state_dim > 1 else ("time [s]", robot.state[0])
+    axes[0].set(xlabel=names[0], ylabel=names[1])
     for i, ax in enumerate(axes[1:]):
         follower = robot.follows[i]
         driven = np.concatenate([t.inputs[:, i] for t in data.trajectories])

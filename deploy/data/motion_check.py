@@ -131,24 +131,29 @@ def speed_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, float
     An omnidirectional robot moves in every direction, so only its speeds show the unit of its heading. The score is the
     largest correlation of another column with one of the two speeds. Speeds along x and y do not count.
     """
-    return {unit: max(_speed_matches(log, name, angles)) for unit, angles in _readings(log, name, given).items()}
+    others = _other_columns(log, name)
+    return {unit: max(_speed_matches(log, others, angles)) for unit, angles in _readings(log, name, given).items()}
 
 
-def _speed_matches(log: AlignedLog, name: str, angles: Array) -> tuple[float, float]:
+def _other_columns(log: AlignedLog, heading: str) -> list[str]:
+    """Return the columns that may hold a speed along or across the heading: not the pose, nor speeds along x and y."""
+    along_axes = speeds_of_motion(log, "")
+    return [
+        name
+        for name in log.columns
+        if name not in (*log.positions, heading) and speed_fit(log, name, along_axes, name in log.inputs) is None
+    ]
+
+
+def _speed_matches(log: AlignedLog, columns: list[str], angles: Array) -> tuple[float, float]:
     """Return the largest correlation of a column with the motion along angles (rows,) [rad], and of one across them.
 
-    Both are 0 if the angles hardly change. name: of the heading, which is no such column; nor are speeds along x and y.
+    Both are 0 if the angles hardly change.
     """
     if np.ptp(angles) <= LEAST_TURN:
         return 0.0, 0.0
-    along_axes = speeds_of_motion(log, "")
-    others = [
-        other
-        for other in log.columns
-        if other not in (*log.positions, name) and speed_fit(log, other, along_axes, other in log.inputs) is None
-    ]
     along, across = (
-        max((best_fit(log, other, [speed], other in log.inputs).correlation for other in others), default=0.0)
+        max((best_fit(log, name, [speed], name in log.inputs).correlation for name in columns), default=0.0)
         for speed in _along_and_across(log, angles)
     )
     return along, across
@@ -165,8 +170,9 @@ def mirrored_heading(log: AlignedLog, name: str) -> str:
     if abs(mirrored) >= COHERENT and abs(same) <= INCOHERENT:
         from_y = abs(abs(0.5 * math.atan2(mirrored.imag, mirrored.real)) - math.pi / 2.0) < 0.4
     else:
-        as_it_is = log.columns[name]
-        right, negated, turned = (_speed_matches(log, name, a) for a in (as_it_is, -as_it_is, math.pi / 2.0 - as_it_is))
+        as_it_is, others = log.columns[name], _other_columns(log, name)
+        readings = as_it_is, -as_it_is, math.pi / 2.0 - as_it_is
+        right, negated, turned = (_speed_matches(log, others, angles) for angles in readings)
         if max(negated) <= max(SAME_CORRELATION, max(right) + 0.1):
             return ""
         from_y = sum(turned) > sum(negated) + 0.1

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from brakeline.errors import BadData
-from brakeline.logs.reader import open_log
+from brakeline.logs.reader import Log, Paths, find, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
@@ -55,6 +55,22 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
     data.check()
     left_out = f"; {repeats} repeated episodes left out" if repeats else ""
     return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{left_out}{damage}"
+
+
+def check_logs(logs: Paths, robot: Robot, more: Mapping[str, str] = {}) -> None:
+    """Check that the vectors in logs have the meaning that the description of the robot gives them.
+
+    Args:
+        more: as for `check_described`.
+
+    Raises:
+        LogError: a path is no log.
+        BadData: a file was recorded with another description of the robot.
+    """
+    for path in find(logs):
+        log_file = Log((path,))
+        next(log_file.rows(), None)  # metadata precede the first message
+        check_described(path, robot, log_file.metadata.get("robots", {}).get(robot.kind, ""), more)
 
 
 def check_described(path: Path, robot: Robot, text: str, more: Mapping[str, str] = {}) -> None:

@@ -13,11 +13,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from brakeline.actors.learner_client import LearnerClient
-from brakeline.deploy.data.run_dataset import check_described
+from brakeline.deploy.data.run_dataset import check_logs
 from brakeline.errors import BadStep
 from brakeline.learner.step_ledger import StepLedger
 from brakeline.learner.transition_reader import StepReader
-from brakeline.logs.reader import Log, by_run, find, open_log
+from brakeline.logs.reader import by_run, find, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
@@ -61,7 +61,7 @@ class LoggedSteps:
     reason: str = ""
 
     def __iter__(self) -> Iterator[pb.Step]:
-        check_logs(self.logs, self.robot)
+        check_logs(self.logs, self.robot, SCALES)
         intake, earlier = StepReader(self.robot), _EarlierLogs()
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
             ledger, sessions = StepLedger(), _Sessions()
@@ -89,19 +89,6 @@ class LoggedSteps:
                     step.actor = f"{step.actor}.run{number}"
                 yield step
             self.damage += log_of_run.damage.lines
-
-
-def check_logs(logs: Sequence[str], robot: RobotWithTask) -> None:
-    """Check that a learner can use the steps of a robot in logs: another description gives steps another meaning.
-
-    Raises:
-        LogError: a path is no log.
-        BadData: a file was recorded with another description of the robot.
-    """
-    for path in find(logs):
-        log_file = Log((path,))
-        next(log_file.rows(), None)  # metadata precede the first message
-        check_described(path, robot, log_file.metadata.get("robots", {}).get(robot.kind, ""), SCALES)
 
 
 class _EarlierLogs:

@@ -17,6 +17,7 @@ from rich.console import Console
 from brakeline import Filter, InProcess
 from brakeline.deploy import progress
 from brakeline.deploy.cli import COMMANDS, command_class, main, reason
+from brakeline.deploy.commands import certify_command
 from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
@@ -76,6 +77,8 @@ STATED = {
         ("import", "there is no log to import"),
         ("compare ground --table --results {folder}/none", "none: there are no results of ground"),
         ("robot new {folder}/none/my.toml", "none/my.toml': make the folder"),
+        ("robot check ground --map v=speed", "--from, --map, --unit and --topics are for `robot new`, not for check"),
+        ("robot new {folder}/my.toml --unit v=km/h", "--unit v=km/h: these options are for reading a log; name it"),
         ("certify --data {folder}/none.mcap", "no log at"),
         ("certify --data nothere.safetensors", "no data set at nothere.safetensors"),  # it is not recorded anew
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
@@ -222,6 +225,19 @@ def test_certify_refuses_options_that_would_do_nothing(command, few_data, words,
     assert status == 1 and said in " ".join(err.split())
 
 
+def test_certify_says_with_which_options_commands_load_a_model_set(command, few_data, tmp_path, monkeypatch):
+    """Without them, they load another one: the line sounded as if it were this one."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "my data"))
+    words = ("certify", "--data", few_data, "--certificates", "residual", "--accept-bound", 1, "--use", "--mode")
+    status, page, err = command(*words, "recursion")
+    assert status == 0 and "in use from now on by commands with --mode recursion; without that, they load" in page, err
+    assert "other commands refuse this model set unless" in page, "its bound is above the robot's own limit"
+    monkeypatch.setattr(certify_command, "refusal", lambda *_: "")
+    status, page, err = command(*words, "direct")
+    assert status == 0 and "residual-direct.safetensors: in use from now on\n" in page, err
+    assert "other commands refuse" not in page, "a larger --accept-bound than needed changes nothing"
+
+
 def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(
     command, figures, few_data, monkeypatch
 ):
@@ -363,6 +379,15 @@ def test_every_method_of_the_service_can_be_chosen_and_named_in_a_configuration(
 
 
 # --- `brakeline robot` -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [("{log}", "{csv}"), ("{csv}", "{log}"), ("{log}", "--unit", "v=km/h")])
+def test_a_new_description_from_a_run_takes_nothing_else(command, log, tmp_path, words):
+    """The second log and the options were ignored in silence."""
+    drive_csv = write_csv(tmp_path / "drive.csv", *drive(seconds=10.0))
+    places = (word.format(log=log, csv=drive_csv) for word in words)
+    status, _, err = command("robot", "new", tmp_path / "my.toml", "--from", *places)
+    assert status == 1 and "give one such log alone, without --map" in err and not (tmp_path / "my.toml").exists()
 
 
 def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, figures, tmp_path):

@@ -73,6 +73,20 @@ def test_csv_of_a_robot_without_a_task_has_all_but_observations(tmp_path, comman
         assert status == 1 and said in err
 
 
+@pytest.mark.parametrize("form", [("--csv", "steps.csv"), ("--minari", "mine/ground-v0")])
+def test_columns_of_another_description_are_not_named_by_that_of_today(form, tmp_path, command) -> None:
+    """Two coordinates have changed places since: their values stood below each other's names."""
+    robot = robot_named("ground")
+    *pose, one, other = robot.description["state"].items()
+    then = robot.description | {"state": dict([*pose, other, one])}
+    step = pb.Step(robot="ground", actor="a", state=[0.0] * robot.state_dim, action=[0.0, 0.0])
+    written(tmp_path / "run.mcap", [("step/ground/a", step, 1)], {"robots": {"ground": json.dumps(then)}})
+    target = tmp_path / form[1] if form[0] == "--csv" else form[1]
+    status, _, err = command("export", tmp_path, form[0], target)
+    assert status == 1 and "was recorded with another description of ground: coordinates" in err
+    assert not (tmp_path / "steps.csv").exists()
+
+
 @pytest.mark.parametrize("words", [("export", "--csv"), ("export", "--tlog"), ("analyse", "--html")])
 def test_no_file_is_written_over_a_log(log, words, tmp_path, command) -> None:
     """`brakeline export --csv run.mcap` means a log, not a file to write."""

@@ -7,12 +7,14 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from brakeline.deploy.cli import main
+from brakeline.deploy.data.coverage import coverage, draw_coverage
 from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import BadData, NoSource
-from brakeline.safety.model.dataset import Dataset
+from brakeline.messaging.robot_description import robot_from_description
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.repeated_driving import repeated_driving
 from brakeline.safety.model.windows import _off_chord
 from tests.deploy.data.bags import (
@@ -451,3 +453,19 @@ def test_excitation_fills_what_is_missing_and_stays_inside(capsys):
         robot = Porter(np.random.default_rng(0))
         way = [robot.step(u, 0.2) for u in rows[rows[:, 1] == run, 2:]]
         assert (np.abs(np.concatenate(way)) < [1.5, 1.0]).all(), "in a simulator that has a lag"
+
+
+def test_the_driving_of_a_single_joint_is_drawn_over_the_time(tmp_path):
+    """It has no second coordinate to draw it against: the command ended with a traceback, and imported nothing."""
+    joint = {
+        "name": "joint",
+        "period": 0.1,
+        "state": {"angle": {"unit": "rad", "error": 0.0}},
+        "input": {"rate": {"unit": "rad/s", "low": -0.5, "high": 0.5}},
+        "limit": [{"name": "end", "weights": {"angle": 1.0}, "most": 1.0}],
+        "plan": {"horizon": 4, "brake": 1},
+    }
+    still = Trajectory(np.zeros((61, 1)), np.zeros((60, 1)), np.zeros((60, 2, 1)), np.zeros(60))
+    data = Dataset(robot_from_description(joint), (still,))
+    draw_coverage(data, coverage(data), tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")

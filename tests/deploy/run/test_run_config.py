@@ -20,6 +20,7 @@ from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import client_settings, metrics_address, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, SEEDS, RunConfig, decode, encode, load
 from brakeline.deploy.run.run_keys import make_run_keys
+from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.bus.identity import tls
@@ -225,6 +226,9 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, 
         for folder in (first, second):
             (folder / "config.json").touch()
     assert empty.name == "20260930-120000_3" and sorted(Path("runs").iterdir()) == [first, second]
+    with run_folder(None) as locked, only_launcher(locked):
+        pass
+    assert not locked.exists(), "a lock is no run"
     Path("runs").rename("elsewhere")
     Path("runs").symlink_to("nowhere")
     with pytest.raises(FileExistsError), run_folder(None):
