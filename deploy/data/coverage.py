@@ -30,6 +30,7 @@ NEAR = 0.05  # share of an input's range: values this close to a bound count as 
 FEWEST_CRUISES = plans_needed(0.1)  # plans of a kind that, without a violation, bound its share outside by 10 %
 MOST_SHOWN = 3  # groups of violations in a message
 VAGUE = 0.25  # of a plan's way: a wider tube shows that the model predicts little
+TOO_FAST = 3.0  # times as far as its follower: an input that jumps farther in a period
 MOST_PLANS = 10**6  # largest number of plans that advice asks for
 
 
@@ -169,13 +170,35 @@ def _relation_missing(report: ValidationReport, data: Dataset) -> list[str]:
     horizon, d = data.robot.horizon, data.robot.position_dim
     ways = [np.linalg.norm(t.states[horizon:, :d] - t.states[:-horizon, :d], axis=1) for t in data.trajectories]
     way = float(np.quantile(np.concatenate(ways), 0.99)) if d and any(map(len, ways)) else 0.0
-    if report.mode != ONE_STEP or report.unit != "m" or report.half_width_full <= VAGUE * way:
+    if report.mode != ONE_STEP or report.unit != "m":
+        return []
+    faster = _faster_inputs(data)
+    if report.half_width_full <= (0.5 if faster else 1.0) * VAGUE * way:
         return []
     return [
         f"a clear relation between inputs and motion: where the robot stops from full speed is known only to "
         f"±{report.half_width_full:.2g} m, and a plan is {way:.2g} m long. Look for a wrong column, sign or time stamp "
-        "in the log, for a state that the description lacks, and for a delay of more than one period"
+        "in the log, for a state that the description lacks, and for a delay of more than one period" + faster
     ]
+
+
+def _faster_inputs(data: Dataset) -> str:
+    """Return more advice if inputs jump much farther in a period than the coordinates that follow them move."""
+    inputs, states = column_names(data.robot)[1], data.robot.state
+    seen = []
+    for i, follower in followed_inputs(data.robot):
+        jump = max(np.abs(np.diff(t.inputs[:, i])).max(initial=0.0) for t in data.trajectories)
+        move = np.quantile(np.concatenate([np.abs(np.diff(t.states[:, follower])) for t in data.trajectories]), 0.99)
+        if jump > TOO_FAST * move > 0.0:
+            name, unit = split_label(states[follower])
+            moves = f"the measured {name} by {move:.2g} {unit}"
+            seen.append(f"the input {inputs[i]} jumps by {jump:.2g} {unit} in a period, {moves}")
+    if not seen:
+        return ""
+    return (
+        f". Or the robot limits its acceleration ({'; '.join(seen)}): then record driving whose inputs change no "
+        "faster than the robot, and write these changes as `slew` into the description"
+    )
 
 
 def _turns_missing(report: ValidationReport, robot: Robot) -> list[str]:

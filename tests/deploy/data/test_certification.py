@@ -1,5 +1,6 @@
 """Model sets that are widened until they hold the held-out plans, and the advice on a bound that is above the limit."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -98,7 +99,19 @@ def test_a_tube_as_wide_as_a_plan_is_long_asks_for_the_columns(held, data):
     vague = replace(held, mode="one-step", half_width_full=0.2)
     (line,) = recording_advice(vague, loose)
     assert "known only to ±0.2 m" in line and "Look for a wrong column, sign or time stamp" in line
+    assert "limits its acceleration" not in line
     assert not recording_advice(replace(vague, half_width_full=0.01), loose)
+
+
+def test_inputs_that_jump_farther_than_the_robot_moves_ask_for_a_slew(held, data):
+    """As those of a robot whose motors limit its acceleration: the jumps saturate, which no product of them shows."""
+    slower = [replace(one, states=one.states * [1.0, 1.0, 1.0, 0.1, 1.0]) for one in data.trajectories]
+    sluggish = replace(data, robot=replace(GROUND, accept_bound=0.9), trajectories=slower)
+    (line,) = recording_advice(replace(held, mode="one-step", half_width_full=0.2), sluggish)
+    assert re.search(
+        r"\(the input command speed jumps by 0\.2\d? m/s in a period, the measured speed by 0\.0\d+ m/s\)", line
+    )
+    assert "write these changes as `slew` into the description" in line and "turn rate" not in line
 
 
 def test_few_cruises_are_missing_from_the_data_of_a_policy_that_will_cruise(held, data):
