@@ -74,19 +74,6 @@ def test_a_condition_that_cannot_be_is_refused(kind, name, value, said) -> None:
         kind(**{name: value})
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("quadrotor --wind nan", "--wind is a number from -1e+09 to 1e+09, not nan"),
-        ("quadrotor --noise nan", "--noise is a number from -1e+09 to 1e+09, not nan"),
-        ("ground --noise -1", "= -1.0 is not"),
-    ],
-)
-def test_a_command_says_which_value_cannot_be(words, said, capsys) -> None:
-    assert cli.main(["evaluate", *words.split(), "--episodes", "1"]) == 1
-    assert said in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.kind)
 @pytest.mark.parametrize("changed", [Conditions(payload_kg=0.3), Conditions(weak_motor=0.5)], ids=["payload", "motor"])
 def test_a_payload_and_a_weak_motor_change_how_a_vehicle_moves(robot, changed) -> None:
