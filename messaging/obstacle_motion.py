@@ -38,6 +38,9 @@ class Sighting:
 class Motion:
     """The motion of an obstacle. Exactly one of `acceleration` and `speed` bounds it; `speed` ignores the velocity.
 
+    The shape moves without turning. Of an obstacle that also turns, give the disc or ball around the point that you
+    track.
+
     >>> Motion(velocity=(0.5, 0.0), position_error=0.03, velocity_error=0.05, acceleration=2.0).radius(0.0)
     0.03
 

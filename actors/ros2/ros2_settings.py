@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -65,3 +66,5 @@ class SensorSettings:
         check_numbers(self, "least_width", above=0.0)
         if self.mount is not None:
             check_numbers(self.mount, "x", "y", "yaw", "tilt")
+            if abs(self.mount.yaw) > math.tau:  # all obstacles would be in another direction
+                raise ValueError(f"the lidar's yaw is {self.mount.yaw:g} rad, more than a turn: give it in radians")

@@ -12,7 +12,15 @@ from brakeline.actors.ros2.laser_beams import LaserBeams, read
 from brakeline.actors.ros2.laser_obstacles import HitErrors, obstacles
 from brakeline.actors.ros2.odometry import OdometryHistory, StepLimits
 from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings
-from brakeline.actors.ros2.sensor_frames import MOST_LEAN, MOST_TILT, TransformTree, frame_name, pose_of
+from brakeline.actors.ros2.sensor_frames import (
+    FARTHEST_MOUNT,
+    MOST_LEAN,
+    MOST_TILT,
+    PlanarPose,
+    TransformTree,
+    frame_name,
+    pose_of,
+)
 from brakeline.actors.ros2.unknown_space import UnknownSpace
 from brakeline.errors import BadScan, InputMissing, PoseJumped
 from brakeline.messaging.obstacle import Obstacle
@@ -138,11 +146,7 @@ class RosInputs:
         if mount is None:
             why = f"no transform from {base!r} to {frame!r}" if base else "the odometry names no child frame"
             raise InputMissing(f"{why}: give the lidar's place")
-        if mount.tilt > MOST_TILT:
-            raise InputMissing(
-                f"{frame!r} is tilted by {math.degrees(mount.tilt):.1f}° against {base!r}: a lidar may be tilted by at "
-                f"most {math.degrees(MOST_TILT):.0f}°"
-            )
+        self._check_mount(mount, frame, base)
         try:
             unknown = self._unknown.boxes(beams, poses, mount, around)
         except BadScan as error:
@@ -158,6 +162,19 @@ class RosInputs:
         if command is None or not now - command.at <= self.limits.command:  # a limit of NaN accepts nothing
             return None
         return command
+
+    def _check_mount(self, mount: PlanarPose, frame: str, base: str) -> None:
+        """Raise InputMissing if a lidar can't be where a transform or the settings place it on the robot."""
+        if mount.tilt > MOST_TILT:
+            raise InputMissing(
+                f"{frame!r} is tilted by {math.degrees(mount.tilt):.1f}° against {base!r}: a lidar may be tilted by at "
+                f"most {math.degrees(MOST_TILT):.0f}°"
+            )
+        if not (away := math.hypot(mount.x, mount.y)) <= FARTHEST_MOUNT * self.robot.footprint:
+            raise InputMissing(
+                f"the lidar is {away:.4g} m from the origin of {base!r}, but the body reaches "
+                f"{self.robot.footprint:g} m: give the lidar's place in m"
+            )
 
     def _no_odometry(self) -> OdometryHistory:
         return OdometryHistory(StepLimits.of(self.robot, self.limits.odometry), self.limits.odometry)

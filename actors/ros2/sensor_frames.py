@@ -16,6 +16,7 @@ from brakeline.messaging.ros2.cdr_messages import Transform, TransformStamped, y
 
 MOST_TILT = math.radians(3.0)  # of a lidar against the robot
 MOST_LEAN = math.radians(18.0)  # of a robot against the frame of its odometry, as on a ramp
+FARTHEST_MOUNT = 10.0  # radii of the body from the robot's position to its lidar: a place in mm is farther away
 LONGEST_CHAIN = 32  # transforms from one frame to another
 
 

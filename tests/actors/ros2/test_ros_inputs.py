@@ -311,6 +311,28 @@ def test_without_a_child_frame_the_lidar_has_no_place():
         bare.obstacles(np.zeros(2), 10.1)
 
 
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize(("x", "accepted"), [(-0.032, True), (0.9, True), (-32.0, False), (3.2, False)])
+def test_a_lidar_whose_place_is_in_mm_or_cm_is_refused(stated, x, accepted):
+    """All obstacles were metres away, so a wall before the robot was free space."""
+    inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose(x) if stated else None), AgeLimits())
+    inputs.on_fixed_transforms(cdr.TFMessage(transforms=[transform("base_footprint", "base_scan", x)]))
+    inputs.on_odometry(odometry(10.0))
+    inputs.on_scan(scan_of(np.full(BEAMS, 0.3)))
+    if accepted:
+        assert inputs.obstacles(np.zeros(2), 10.0)
+        return
+    with pytest.raises(InputMissing, match=r"the lidar is 3.* m from the origin of 'base_footprint'.* place in m"):
+        inputs.obstacles(np.zeros(2), 10.0)
+
+
+def test_a_yaw_of_the_lidar_in_degrees_is_refused():
+    for yaw in (math.pi, -1.5 * math.pi):
+        assert SensorSettings(mount=PlanarPose(0.0, 0.0, yaw)).mount is not None
+    with pytest.raises(ValueError, match="yaw is 180 rad, more than a turn: give it in radians"):
+        SensorSettings(mount=PlanarPose(0.0, 0.0, 180.0))
+
+
 def test_an_age_limit_that_is_no_number_accepts_nothing():
     limits = AgeLimits(odometry=math.nan, scan=math.nan, command=math.nan)
     inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose()), limits)
