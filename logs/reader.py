@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations, groupby, pairwise
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 from google.protobuf.message import DecodeError, Message
@@ -173,7 +174,9 @@ class Log:
             LogError: the file is not an MCAP file, or it is a ROS bag.
         """
         if is_ros(path):
-            raise LogError(f"{path} is a ROS bag, not the log of a run: read it with `brakeline import {path}`")
+            raise LogError(
+                f"{path} is a ROS bag, not the log of a run: read it with `brakeline import {quote(str(path))}`"
+            )
         segment = LogSegment(path, path.stat().st_size, recording=being_written(path))
         self.segments.append(segment)
         self.clock.begin_file()

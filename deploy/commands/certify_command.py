@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from rich.markup import escape
@@ -202,13 +203,15 @@ class CertifyCommand:
         from brakeline.safety.model.dataset import Dataset
 
         if self.robot.endswith(DATA) or Path(self.robot).is_dir():
-            raise ValueError(f"{self.robot} is no robot: `brakeline certify ROBOT --data {self.robot}`")
+            raise ValueError(f"{self.robot} is no robot: `brakeline certify ROBOT --data {quote(self.robot)}`")
         robot = robot_maybe_with_task(self.robot)
         if self.data is None:
             path, data = record_path(robot.in_lockstep()), data_for(robot)
         elif self.data.suffix == ".safetensors":
             if not self.data.exists():  # a mistyped name must not start a recording
-                raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
+                raise ValueError(
+                    f"no data set at {self.data}: `brakeline collect {quote(self.robot)} --out FILE` records one"
+                )
             path, data = self.data, Dataset.load(self.data)
             if robot.kind == data.robot.kind:
                 data = described_today(data, robot, path)

@@ -102,7 +102,8 @@ class CollectCommand:
             if refused:
                 figures["not_used"] = refused
                 errors.print(f"[red]not put to use:[/] {escape(refused)}")
-                errors.print(f"to validate it again: brakeline certify {robot.name} --data {path} --few", markup=False)
+                again = shlex.join(["brakeline", "certify", robot.name, "--data", str(path), "--few"])
+                errors.print(f"to validate it again: {again}", markup=False)
             else:
                 used = put_to_use(model, flight.data, options.default_keys())
                 figures["model"] = str(used)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from shlex import quote
 from typing import ClassVar
 
 from brakeline.deploy.commands.command_output import print_result
@@ -52,6 +53,6 @@ class ExciteCommand:
             driven = drive(robot, self.keep, self.minutes, self.seed, path, advance=advance)
         edge = f"{-driven.outside:.2f} m inside the region" if driven.outside <= 0.0 else f"{driven.outside:.2f} m OUT"
         counts = f"{driven.periods} periods in {driven.runs} runs; the body came to {edge}"
-        following = f"next: brakeline import LOG {path} --robot {self.robot}"
+        following = f"next: brakeline import LOG {quote(str(path))} --robot {quote(self.robot)}"
         print_result(self.json, asdict(driven), f"{path}: {counts}", following)
         return 0

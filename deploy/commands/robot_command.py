@@ -71,7 +71,8 @@ class RobotCommand:
             raise ValueError(f"{self.file}: a description is a file NAME.toml, NAME of letters, digits, '_' and '-'")
         if path.exists():
             raise ValueError(
-                f"{path} exists: check it with `brakeline robot check {path}`, delete it, or choose another name"
+                f"{path} exists: check it with `brakeline robot check {shlex.quote(self.file)}`, delete it, or choose "
+                "another name"
             )
         text = (ROBOTS_FOLDER / "template.txt").read_text("utf-8").replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
@@ -79,10 +80,10 @@ class RobotCommand:
         if self.from_:
             text, notes = _from_logs(self.from_, text, path.stem, options)
         path.write_bytes(text.encode())  # TOML is UTF-8 in any locale
-        following = f"{path}: fill it in, then `brakeline robot check {path}`"
+        following = f"{path}: fill it in, then `brakeline robot check {shlex.quote(self.file)}`"
         if words := options.words():
             logs = shlex.join(map(str, self.from_))
-            following += f" and `brakeline import {logs} --robot {path} {words}`"
+            following += f" and `brakeline import {logs} --robot {shlex.quote(self.file)} {words}`"
         print_result(self.json, {"file": str(path), "notes": list(notes)}, *notes, following)
         return 0
 
@@ -95,7 +96,7 @@ class RobotCommand:
         if isinstance(tasked, RobotWithTask):
             problems, missing = _code_problems(tasked.task)
             problems += _arena_problems(tasked)
-            remarks, collect = [*remarks, *missing], f", or `brakeline collect {self.file}`"
+            remarks, collect = [*remarks, *missing], f", or `brakeline collect {shlex.quote(self.file)}`"
             if problems:
                 lines = "".join(f"\n  {place}: {what}" for place, what in problems)
                 return self._refuse(problems, f"{robot.name}: the task has mistakes:{lines}")
@@ -104,7 +105,7 @@ class RobotCommand:
             {"file": self.file, "problems": [], "remarks": remarks},
             f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake",
             *(f"  {line}" for line in (*remarks, _task_text(self.file))),
-            f"next: `brakeline import LOG --robot {self.file}`{collect}",
+            f"next: `brakeline import LOG --robot {shlex.quote(self.file)}`{collect}",
         )
         return 0
 

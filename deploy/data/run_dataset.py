@@ -6,6 +6,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -49,7 +50,8 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
         content = ", ".join(f"{count} of {key}" for key, count in others.most_common(MOST_NAMED)) or "none"
         raise BadData(
             f"{path}: no trajectory of {robot.name}, of which it has {len(steps)} steps{damage}. Other messages: "
-            f"{content}. See what the log holds with `brakeline analyse {path}`, or name its robot with --robot"
+            f"{content}. See what the log holds with `brakeline analyse {quote(str(path))}`, or name its robot with "
+            "--robot"
         )
     data = Dataset(robot, trajectories, {"origin": "log"} | about_age(step.acceleration_age for step in steps))
     data.check()
@@ -87,8 +89,8 @@ def check_described(path: Path, robot: Robot, text: str, more: Mapping[str, str]
     if changed := [word for name, word in parts.items() if getattr(recorded, name) != getattr(robot, name)]:
         raise BadData(
             f"{path} was recorded with another description of {robot.name}: {', '.join(changed)} differ. Get the "
-            f"description of then with `brakeline robot new {robot.kind}.toml --from {path}`, in another folder, or "
-            "record again"
+            f"description of then with `brakeline robot new {robot.kind}.toml --from {quote(str(path))}`, in another "
+            "folder, or record again"
         )
 
 

@@ -287,7 +287,7 @@ def _content(tables: Sequence[Table]) -> str:
 
 
 def _from_columns(table: Table, options: LogOptions) -> _Fields:
-    chosen = {name: place for name, place in options.fields.items() if name != TIME}
+    chosen = {n: next((f for _, f in fields_named([table], p)), p) for n, p in options.fields.items() if n != TIME}
     if missing := [place for place in chosen.values() if place not in table.columns]:
         raise NoSource(f"--map: there is no column {missing[0]}; the columns are: {', '.join(table.columns)}")
     axes = {m[1].lower(): name for name in (*table.columns,)[::-1] if (m := POSITION.fullmatch(name.strip()))}

@@ -102,7 +102,7 @@ def in_header_units(table: Table, given: Sequence[str] = ()) -> Table:
             columns[name] = values
             continue
         if folded(plain) in chosen:
-            columns[plain] = values
+            columns[plain], units[plain] = values, si_of(unit)
             continue
         columns[plain], units[plain] = values * scale, si_of(unit)
         if scale != 1.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from shlex import quote
 from types import TracebackType
 from typing import Any, Self
 
@@ -204,7 +205,7 @@ def following(figures: dict[str, Any]) -> list[str]:
     """Return useful commands after a run, besides that of the verdict."""
     folder, robots, commands = figures["folder"], list(figures["robots"]), []
     if figures["log"]:
-        commands.append(f"brakeline replay {folder}")
+        commands.append(f"brakeline replay {quote(folder)}")
     if figures["policies"] and len(robots) == 1:
-        commands.append(f"brakeline evaluate {robots[0]} --policy {figures['policies'][0]}")
+        commands.append(f"brakeline evaluate {robots[0]} --policy {quote(figures['policies'][0])}")
     return commands

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def check_resumable(config: RunConfig, folder: Path) -> None:
                 f"{folder}: the learner has {learned} steps of its own, and would take steps of {', '.join(others)} "
                 "for those of its own actors, which it has already. With --resume, --from-logs replaces a lost "
                 "checkpoint by the log of the run. To learn from both, begin a new run: `brakeline train --from-logs "
-                f"{folder} {' '.join(others)}`"
+                f"{shlex.join([str(folder), *others])}`"
             )
         if config.steps < min(stored.steps, learned):
             raise LaunchError(
@@ -51,7 +52,7 @@ def _without_checkpoint(config: RunConfig, folder: Path) -> str:
     if config.backend == BATCH or config.deterministic:
         why = "a run with --backend batch or --deterministic does not learn from its log"
         return f"Begin anew in another folder: --out ({why})"
-    again = f"`brakeline train --resume {folder} --from-logs {folder}`"
+    again = f"`brakeline train --resume {shlex.quote(str(folder))} --from-logs {shlex.quote(str(folder))}`"
     return f"Learn again from the run's log: {again}. Or begin anew in another folder: --out"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
+from shlex import quote
 
 from brakeline.errors import BadKeys
 from brakeline.messaging.message_checks import NAME
@@ -112,7 +113,8 @@ def tls(folder: Path, source: str, listens: bool) -> dict[str, object]:
     for path in (root, certificate, key):
         if not path.is_file():
             raise BadKeys(
-                f"{path} is missing: no keys of {name} here; issue them with `brakeline keys {folder} {name}`"
+                f"{path} is missing: no keys of {name} here; issue them with "
+                f"`brakeline keys {quote(str(folder))} {name}`"
             )
     return {
         "root_ca_certificate": str(root),

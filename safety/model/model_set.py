@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -294,7 +295,7 @@ def path_of_model(source: Path | str) -> Path:
     path = Path(source)
     if path.suffix == ".toml":
         raise BadModel(
-            f"{path} is a description: give the model set that `brakeline certify {path} --use` wrote, "
+            f"{path} is a description: give the model set that `brakeline certify {quote(str(path))} --use` wrote, "
             "such as data/NAME/residual-one-step.safetensors"
         )
     if isinstance(source, str) and source == path.name and not path.suffix:

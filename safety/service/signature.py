@@ -19,6 +19,7 @@ import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any, Self
 
 import numpy as np
@@ -72,7 +73,7 @@ class SignedModel:
             return cls(path.read_bytes(), str(seal["claim"]).encode(), bytes.fromhex(seal["signature"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise Untrusted(
-                f"{path} has no seal ({error}): sign it with `brakeline keys FOLDER --sign {path}`"
+                f"{path} has no seal ({error}): sign it with `brakeline keys FOLDER --sign {quote(str(path))}`"
             ) from error
 
 

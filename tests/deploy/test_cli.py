@@ -23,7 +23,7 @@ from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
 from brakeline.deploy.commands.query_command import OBSTACLE_FORMS, load_scan, parse_obstacle, plan_table, proposal
 from brakeline.deploy.experiments.compared_methods import METHODS
-from brakeline.errors import BadScan
+from brakeline.errors import BadScan, Untrusted
 from brakeline.logs.figure_tables import analyse
 from brakeline.logs.run_groups import METHOD_COLORS
 from brakeline.logs.segment import open_segment
@@ -37,6 +37,7 @@ from brakeline.safety.model import model_config
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.validation import ValidationReport
+from brakeline.safety.service.signature import SignedModel
 from tests.deploy.data.porter import FILE, drive, write_csv
 from tests.robots import QUADROTOR
 from tests.waiting import until
@@ -379,6 +380,17 @@ def test_every_method_of_the_service_can_be_chosen_and_named_in_a_configuration(
 
 
 # --- `brakeline robot` -------------------------------------------------------------------------------------------
+
+
+def test_a_command_that_a_message_names_can_be_pasted_into_a_shell(command, tmp_path):
+    """Folders have names with spaces, too."""
+    (folder := tmp_path / "my robots").mkdir()
+    path = folder / "rover.toml"
+    for words in (("robot", "new", path), ("robot", "new", path), ("robot", "check", path)):
+        _, out, err = command(*words)
+        assert f"'{path}'" in (out + err).replace("\n", ""), words
+    with pytest.raises(Untrusted, match=f"--sign '{path}'"):
+        SignedModel.load(path)
 
 
 @pytest.mark.parametrize("words", [("{log}", "{csv}"), ("{csv}", "{log}"), ("{log}", "--unit", "v=km/h")])

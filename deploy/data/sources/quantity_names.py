@@ -130,7 +130,7 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
 def fields_named(tables: Sequence[Table], place: str) -> list[Place]:
     """Return the fields that `TABLE/FIELD` or `FIELD` names, or the header `FIELD [UNIT]` of a file of columns."""
     named = [(t, f) for t in tables for f in t.columns if place in (f"{t.name}/{f}", f)]
-    return named or [(t, f) for t in tables for f in t.columns if not t.name and f == split_header(place)[0]]
+    return named or [(t, f) for t in tables for f in t.units if f in t.columns and f == split_header(place)[0]]
 
 
 def first_ranked(candidates: Sequence[Place]) -> list[Place]:

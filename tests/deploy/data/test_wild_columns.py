@@ -227,7 +227,7 @@ def test_a_header_names_the_unit_of_a_column_beside_one_of_the_same_name(driven,
 
 
 @pytest.mark.parametrize("unit", ["deg", "rad", "1"])
-def test_a_unit_that_an_option_names_counts_instead_of_that_in_the_header(driven, plain, tmp_path, unit):
+def test_a_unit_that_an_option_names_counts_instead_of_that_in_the_header(driven, plain, tmp_path, capsys, unit):
     """Before, both counted: positions in mm became a thousand times too small, and a wrong header stayed wrong."""
     time, values = driven[0], driven[1].copy()
     values[:, 2] = np.degrees(values[:, 2]) if unit == "deg" else values[:, 2]
@@ -239,6 +239,12 @@ def test_a_unit_that_an_option_names_counts_instead_of_that_in_the_header(driven
         same(imported(path, *places, *units), plain, 1e-8)
     if unit == "deg":
         same(imported(path, "--map", "heading=heading [deg]"), plain, 1e-8)
+        inputs = ("command speed=speed", "command turn=turn rate")
+        words = ["--map", "x=x", "y=Y (mm)", "heading=heading [deg]", "v=v", "w=w", *inputs]
+        assert main(["robot", "new", str(tmp_path / "mapped.toml"), "--from", str(path), *words]) == 0
+        assert robot_named(str(tmp_path / "mapped.toml")).heading is not None
+    text = refused(capsys, ["import", path, "--robot", FILE, *units, "--map", "v=v [mm/s]"])
+    assert "there is no 'v [mm/s]' (--map)" in text, "no header names this unit"
     mine = tmp_path / "my.toml"
     assert main(["robot", "new", str(mine), "--from", str(path), "--unit", "x=mm", "Y=mm", f"heading={unit}"]) == 0
     assert robot_named(str(mine)).heading is not None and "turn rate [rad/s]" in robot_named(str(mine)).action

@@ -1,6 +1,7 @@
 """Console output of a run, on a terminal of 80 columns and in a file."""
 
 import io
+import shlex
 from pathlib import Path
 
 import pytest
@@ -159,6 +160,9 @@ def test_all_figures_and_paths_are_whole(view: Launcher) -> None:
     assert f"log:    {folder}/run.mcap" in rows and f"policy: {folder}/policy.safetensors" in rows
     assert any(row.endswith("restarts: learner 2, safety-0 1") for row in rows)
     assert f"next:   brakeline replay {folder}" in rows, "and what comes next"
+    mine = figures | {"folder": "/disk/my run", "policies": ["/disk/my run/policy.safetensors"]}
+    words = [shlex.split(row) for row in rows_of(mine, verbose=True) if row.startswith("next:")]
+    assert {"/disk/my run", "/disk/my run/policy.safetensors"} <= {line[-1] for line in words}, "a shell takes them"
 
 
 def test_what_a_run_is_at_is_said_from_the_first_second(view: Launcher) -> None:
