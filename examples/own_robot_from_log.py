@@ -9,10 +9,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import small_log
 
-from brakeline import BackupPlan, Filter, ModelSet, Obstacle, Request, Shapes
+from brakeline import Filter, InProcess, Obstacle
 from brakeline.deploy.cli import main as brakeline
 
 
@@ -29,18 +28,19 @@ def main(kind: str = "csv") -> None:
         brakeline(["import", str(log), "--robot", str(robot)])
         brakeline(["certify", str(robot), "--use"])
 
-        filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-one-step.safetensors"))
+        filter = Filter.load(folder / "data" / "my-robot" / "residual-one-step.safetensors")
         print(f"a full stop from full speed is known to {100.0 * filter.half_width(filter.robot.high()):.0f} cm")
-        decide(filter, 2.0)
-        decide(filter, 0.4)
+        safety = InProcess(filter)
+        decide(safety, 2.0)
+        decide(safety, 0.4)
 
 
-def decide(filter: Filter, distance: float) -> None:
+def decide(safety: InProcess, distance: float) -> None:
     """Print the decision about driving at a pillar at full speed, for a robot that stands."""
-    backup = BackupPlan(filter.robot)  # the committed plan and the input in force: store it between two decisions
-    pillar = Shapes.of([Obstacle("cylinder", (distance, 0.0), (0.1,))], 2)
-    answer = filter.decide(Request(np.zeros(5), np.array([0.4, 0.0]), backup.input_in_force, backup.plan, pillar))
-    print(f"pillar at {distance} m: {answer.kind}, {answer.plan[0][0]:.2f} m/s")
+    safety.reset()  # once, when the robot stands; then call `decide` once a period, and execute `answer.action`
+    pillar = Obstacle("cylinder", (distance, 0.0), (0.1,))  # in the frame of the state: list all within `sight`
+    answer = safety.decide(state=[0.0, 0.0, 0.0, 0.0, 0.0], action=[0.4, 0.0], obstacles=[pillar])
+    print(f"pillar at {distance} m: {answer.kind}, {answer.action[0]:.2f} m/s")
 
 
 if __name__ == "__main__":

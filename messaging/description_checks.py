@@ -150,7 +150,10 @@ def _state_problems(model: DescriptionModel) -> Iterator[Problem]:
         if c.follows not in model.input:
             yield f"state.{name}.follows", f"one of the inputs ({', '.join(model.input)}), not {c.follows!r}"
         elif (unit := model.input[c.follows].unit) != c.unit:
-            yield f"state.{name}.follows", f"in {c.unit!r} it can't follow {c.follows!r}, which is in {unit!r}"
+            yield (
+                f"state.{name}.follows",
+                f"in {c.unit!r} it can't follow {c.follows!r}, which is in {unit!r}: leave it out",
+            )
     followers = Counter(c.follows for c in model.state.values() if c.follows is not None)
     for name, count in followers.items():
         if count > 1:

@@ -154,7 +154,9 @@ class Scan(ComparedByValue):
         if self.ranges.shape != (n,) or self.angles.shape != (n,) or n > MAX_BEAMS:
             raise BadScan(f"a scan has as many ranges as angles, {MAX_BEAMS} at most")
         if not np.isfinite(self.angles).all() or (np.diff(self.angles) <= 0.0).any():
-            raise BadScan("a scan's angles must be finite and ascend")
+            raise BadScan("a scan's angles must be finite and ascend: sort them, together with the ranges")
+        if n and self.angles[-1] - self.angles[0] >= 4.0 * math.pi:
+            raise BadScan(f"a scan's angles reach from {self.angles[0]:g} to {self.angles[-1]:g}: give them in rad")
         if n and self.angles[-1] - self.angles[0] >= 2.0 * math.pi:
             raise BadScan("a scan's angles [rad] span less than a turn: leave out a last beam that repeats the first")
         if np.isinf(self.ranges).any():

@@ -169,6 +169,11 @@ class VectorSafetyWrapper(VectorWrapper):
         """Return the environments' states (k, n) and lists of obstacles; None for one that has a scan only."""
         assert self._now is not None
         states = self._state(self.env, *self._now)
+        if hasattr(states, "__len__") and len(states) != self.num_envs:
+            raise Mismatch(
+                f"state has {len(states)} rows: give one for each of the {self.num_envs} environments. If a function "
+                "reads one environment, wrap each environment in a `SafetyWrapper` instead"
+            )
         near = self._obstacles(self.env, *self._now) if self.client.robot.position_dim else [None] * self.num_envs
         if isinstance(near, dict):
             raise Mismatch("the obstacles are arrays, not a list for each environment: use BatchSafetyWrapper")

@@ -237,7 +237,7 @@ def _too_loose(report: ValidationReport, data: Dataset) -> list[str]:
     minutes = data.periods * data.robot.period / 60.0
     more = math.ceil(minutes * (wanted / plans - 1.0)) if plans and wanted is not None else 0
     if not violations:
-        how = f": record {more} more minutes like these" if plans else ""
+        how = f": record {more} more minute{'s' * (more > 1)} like these" if plans else ""
         return [
             f"{bounded}; to state the limit, {wanted} held-out plans without a violation are needed, and there are "
             f"{plans}{how}"

@@ -228,7 +228,9 @@ class ModelSet:
             one_step = OneStep.of_tensors(tensors) if model_config.mode == ONE_STEP else None
             stands = int(about.get("stands", 0))
         except Exception as error:  # whatever a hostile file makes a parser raise
-            raise BadModel(f"no model set: {type(error).__name__}: {error}") from error
+            made = ". If it is a data set, `brakeline certify --data FILE --use` makes a model set from it"
+            hint = made if str(error).startswith("there is no 'model_set'") else ""
+            raise BadModel(f"no model set: {type(error).__name__}: {error}{hint}") from error
         if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
         layout = "" if about["layout"] == robot.layout() else str(about["layout"])
@@ -272,7 +274,7 @@ class ModelSet:
             refuse_shipped_name(model.robot)
             return model
         except OSError as error:
-            raise BadModel(f"{path}: {error}") from error
+            raise BadModel(_unread(path, error)) from error
         except (BadModel, UnknownRobot) as error:
             raise BadModel(f"{path}: {error}") from error
 
@@ -306,6 +308,16 @@ def path_of_model(source: Path | str) -> Path:
             names = ", ".join(sorted(p.name.partition(".")[0] for p in SHIPPED.glob("*.model.safetensors")))
             raise BadModel(f"no model set comes with {source!r}; there are: {names}, or give the path of a file")
     return path
+
+
+def _unread(path: Path, error: OSError) -> str:
+    """Return why a path gives no model set, and what to give instead."""
+    if path.is_dir():
+        inside = ", ".join(sorted(one.name for one in path.glob("*.safetensors"))) or "no .safetensors"
+        return f"{path} is a folder: give the model set in it (there is {inside})"
+    if isinstance(error, FileNotFoundError):
+        return f"there is no file {path}: `brakeline certify FILE.toml --use` writes a model set and prints its path"
+    return f"{path}: {error}"
 
 
 def checksum(about: dict[str, Any]) -> str:

@@ -111,4 +111,4 @@ def _remedy(about: Mapping[str, str], limit: float) -> str:
     if violations or not 0.0 < more < math.inf:
         left = f"{violations:g} of {windows:g} held-out plans left their tubes"
         return f"{left}: `brakeline certify` says where, and what to do"
-    return f"Record {math.ceil(more)} more minutes like these"
+    return f"Record {math.ceil(more)} more minute{'s' * (more > 1.0)} like these"

@@ -117,7 +117,14 @@ def memory_of(robot: Robot) -> FanMemory | ImageMemory:
     >>> from brakeline import robot_named
     >>> memory_of(robot_named("ground")).unused
     True
+
+    Raises:
+        TypeError: `robot` is no robot.
     """
+    if not isinstance(robot, Robot):
+        raise TypeError(
+            f"memory_of takes a robot, such as `filter.robot` or `client.robot`, not a {type(robot).__name__}"
+        )
     return FanMemory(robot.footprint) if robot.position_dim == 2 else ImageMemory(robot.footprint)
 
 
@@ -138,7 +145,10 @@ def filled(memory: FanMemory | ImageMemory, info: Mapping[str, Any], elapsed: fl
 
     Raises:
         BadRequest: `elapsed` is negative or not finite; then all in memory counts as too old.
+        TypeError: `info` is no mapping.
     """
+    if not isinstance(info, Mapping):
+        raise TypeError(f'filled takes a dict, such as {{"scan": scan}}, not a {type(info).__name__}')
     if "scan" not in info and memory.unused:
         return None
     scan = info.get("scan")

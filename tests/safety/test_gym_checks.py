@@ -47,6 +47,15 @@ def test_a_filter_of_another_body_is_refused(wrap: Wrap) -> None:
         wrap(robot=WIDE)
 
 
+def test_the_state_of_one_environment_is_refused_for_a_vector() -> None:
+    env = vector(state=lambda _, observations, infos: observations[0])
+    env.reset(seed=0)
+    with pytest.raises(
+        Mismatch, match=r"state has 26 rows: give one for each of the 2 environments. If a function reads"
+    ):
+        env.step(env.action_space.sample())
+
+
 def test_a_filter_of_another_robot_is_refused_for_a_batch() -> None:
     with pytest.raises(Mismatch, match="robot quadrotor, the filter was made for ground"):
         batch(robot=QUADROTOR)

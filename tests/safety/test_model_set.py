@@ -138,6 +138,13 @@ def test_a_model_set_is_read_from_the_file_that_it_was_saved_in_and_garbage_is_r
             ModelSet.decode(bad)
     with pytest.raises(BadModel, match=r"my\.toml is a description: give the model set that `brakeline certify"):
         ModelSet.load("my.toml")
+    with pytest.raises(BadModel, match=r"deep is a folder: give the model set in it \(there is model\.safetensors\)"):
+        ModelSet.load(tmp_path / "deep")
+    with pytest.raises(BadModel, match=r"there is no file .*: `brakeline certify FILE\.toml --use` writes a model set"):
+        ModelSet.load(tmp_path / "none.safetensors")
+    with pytest.raises(BadModel, match="`brakeline certify --data FILE --use` makes a model set from it"):
+        record(trajectories=6, periods=60).save(tmp_path / "record.safetensors")
+        ModelSet.load(tmp_path / "record.safetensors")
     path = tmp_path / "model.safetensors"
     with pytest.raises(BadModel, match=str(path)):
         ModelSet.load(path)

@@ -181,3 +181,8 @@ def test_a_malformed_scan_is_refused(wrong):
     Scan(**right)
     with pytest.raises(BadScan):
         Scan(**right | wrong)
+
+
+def test_angles_in_degrees_are_refused_as_such():
+    with pytest.raises(BadScan, match=r"reach from 0 to 359: give them in rad"):
+        Scan(ranges=np.ones(360), angles=np.arange(360.0), pose=(0.0, 0.0, 0.0))

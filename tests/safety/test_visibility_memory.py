@@ -134,6 +134,13 @@ def test_an_episode_that_begins_without_a_scan_frees_nothing_if_the_robot_has_a_
     assert not filled_from_memory(memory, {}, 0.2).valid_beams.any()
 
 
+def test_a_wrong_argument_says_which_one_is_right():
+    with pytest.raises(TypeError, match=r"such as `filter\.robot` or `client\.robot`, not a FanMemory"):
+        memory_of(memory_of(GROUND))
+    with pytest.raises(TypeError, match=r'such as \{"scan": scan\}, not a Scan'):
+        filled_from_memory(memory_of(GROUND), empty(), 0.2)
+
+
 @pytest.mark.parametrize("elapsed", [-2.4, -1e9, math.nan, math.inf])
 @pytest.mark.parametrize("speed", [0.0, 0.5])
 def test_after_a_jump_of_the_clock_everything_in_memory_is_old(elapsed, speed):
