@@ -35,6 +35,7 @@ from brakeline.safety.perception.scan_coverage import gaps
 from brakeline.safety.perception.visibility_memory import FanMemory
 
 FEWER_BEAMS = MAX_BEAMS // 2  # of a scan with more, every second, third, … counts: gaps need room for added beams
+MOST_GAP = math.radians(12.0)  # between two beams: nearly all space between those of a ring of sonars is unknown
 LEFT_OUT = 1.5  # gaps of the scan: two neighbours that are farther apart leave out beams
 WIDEST = math.radians(6.0)  # of a box; a wider gap has several
 LONGEST = 2.0  # s for which a scan stays in the memory: what is dark may have been put there since
@@ -100,8 +101,11 @@ class UnknownSpace:
             beams, poses, mount, around: see `laser_obstacles.obstacles`.
 
         Raises:
-            BadScan: unknown space comes as near as the body.
+            BadScan: unknown space comes as near as the body, or the beams are too few for a lidar's.
         """
+        if beams.gap > MOST_GAP:
+            gap, most = math.degrees(beams.gap), math.degrees(MOST_GAP)
+            raise BadScan(f"beams {gap:.0f}° apart: those of a lidar are at most {most:.0f}°")
         scan, moved, blind = self._scan(beams, poses, mount)
         unknown = scan.angles[~scan.valid_beams]
         filled = self._filled(scan, blind, float(beams.times[-1]))

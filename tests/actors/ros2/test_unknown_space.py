@@ -99,6 +99,14 @@ def test_nothing_around_the_body_is_free_at_the_start_if_nobody_saw_it():
         boxes_of(space(EXACT), free_but(*range(20)))
 
 
+@pytest.mark.parametrize("stated", [0.0, 0.5])
+@pytest.mark.parametrize("beams", [3, 12, 23])
+def test_a_ring_of_sonars_is_no_lidar(beams, stated):
+    """Such a scan was a ValueError about the shapes of arrays."""
+    with pytest.raises(BadScan, match=r"beams \d+° apart: those of a lidar are at most 12°"):
+        boxes_of(stating(stated) if stated else space(), scan_of(np.full(beams, math.inf)))
+
+
 @pytest.mark.parametrize("beams", [180, 1440, 3999])
 def test_scans_with_few_or_many_beams(beams):
     assert boxes_of(space(), scan_of(np.full(beams, math.inf))) == ()
