@@ -21,6 +21,7 @@ from brakeline.messaging.value_equality import ComparedByValue
 MAX_BEAMS = 1000
 MAX_FAR = 1000.0  # largest range of a sensor [m]: a larger one is in mm
 BEYOND_FAR = 10.0  # times `far`; a larger range must be in mm
+MAX_LEAST_WIDTH = 5.0  # of obstacles [m]
 MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]
 MAX_TRACK_VALUE = 1e4  # largest speed [m/s], error [m/s] and acceleration [m/s²] of a track
 
@@ -65,8 +66,9 @@ def check_numbers(
         raise BadScan(f"a {name}'s errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
     if not 0.0 <= far <= MAX_FAR:
         raise BadScan(f"a {name}'s `far` is finite, and from 0 to {MAX_FAR:g} m, not {far:g}: give it in m")
-    if not (math.isfinite(least_width) and least_width > 0.0):
-        raise BadScan(f"a {name}'s least width must be finite and above 0 m, not {least_width:g}")
+    if not 0.0 < least_width <= MAX_LEAST_WIDTH:  # one in mm would free nearly all space between two beams
+        why = f"above 0 m, and {MAX_LEAST_WIDTH:g} m at most"
+        raise BadScan(f"a {name}'s least width is {why}, not {least_width:g}: give it in m; less is safer")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from brakeline.messaging.number_checks import check_numbers
+from brakeline.messaging.number_checks import check_most, check_numbers
 
 if TYPE_CHECKING:
     from brakeline.actors.ros2.sensor_frames import PlanarPose
@@ -64,6 +64,7 @@ class SensorSettings:
     def __post_init__(self) -> None:
         check_numbers(self, "range_error", "free_at_start", least=0.0)
         check_numbers(self, "least_width", above=0.0)
+        check_most(self, "least_width", most=1.0)  # one in mm or cm would free nearly all unknown directions
         if self.mount is not None:
             check_numbers(self.mount, "x", "y", "yaw", "tilt")
             if abs(self.mount.yaw) > math.tau:  # all obstacles would be in another direction

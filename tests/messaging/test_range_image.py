@@ -215,6 +215,7 @@ def test_any_range_in_a_message_beyond_far_means_no_hit():
         ({"position_error": 1e39}, "10000 at most"),  # finite, but not in single precision
         ({"at": (1e20, 0.0, 0.0)}, "within 10000"),
         ({"least_width": 0.0}, "above 0 m"),
+        ({"least_width": 600.0}, "5 m at most, not 600: give it in m"),
         ({"doubt": 2}, "doubt is 0 or 1"),
         ({"angle_error": 1.0}, "angle error"),  # degrees, say: so wide is every shadow that none would be left
         ({"low": 0.5, "high": 0.5 + 1e-6}, "so close"),

@@ -165,6 +165,7 @@ WRONG_BOUNDS = [0.0, 0.0, -0.1, 1.0], [np.nan, 0.0, 0.1, 1.0], [-1e300, 0.0, 0.1
         {"angles": np.linspace(0, 7, 360)},
         {"pose": (0.0, 0.0, math.nan)},
         {"least_width": 0.0},
+        {"least_width": 100.0},  # mm: a sector of 30° without beams was free
         {"speed": -1.0},
         {"age": math.inf},
         {"doubt": 1.5},

@@ -41,6 +41,8 @@ def test_a_range_error_or_a_place_of_the_lidar_that_is_no_number_never_hides_an_
     """With a NaN, no hit was near the robot: a room full of obstacles was free."""
     with pytest.raises(ValueError, match="range_error"):
         SensorSettings(range_error=wrong)
+    with pytest.raises(ValueError, match="least_width"):
+        SensorSettings(least_width=2.0 if wrong < 0.0 else wrong)  # 2 cm: unknown directions were free
     if not math.isfinite(wrong):
         with pytest.raises(ValueError, match="x = "):
             SensorSettings(mount=PlanarPose(wrong, 0.0, 0.0))
