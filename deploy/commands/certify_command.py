@@ -297,13 +297,14 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
     """Return the bounds of a validation report as sentences. period: control period [s]."""
     from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR
 
+    hourly = f"{s.outside_hour:.3g}" if s.outside_hour < 1000.0 else f"{s.outside_hour:,.0f}"
     lines = [
         f"{s.certificate}, {s.mode}, in words, at {CONFIDENCE:.0%} confidence, from {s.windows} held-out plans:",
         f"  a step: at most {percent(s.bound_step)} of steps leave their predicted set ({s.step_violations} did)",
         f"  a plan, driven to its stop: at most {percent(s.bound_plan)} of plans leave their tube ({s.violations} did)",
         f"  an episode of {EPISODE} steps ({EPISODE * period:.0f} s): at most {s.outside_episode:.2g} steps outside on "
         f"average; at least one in up to {percent(s.bound_episode)} of episodes, if steps are independent",
-        f"  an hour of driving ({round(HOUR / period):,} steps): at most {s.outside_hour:.3g} steps outside on average",
+        f"  an hour of driving ({round(HOUR / period):,} steps): at most {hourly} steps outside on average",
     ]
     if s.chosen is not None and s.marginal is not None:
         lines += [

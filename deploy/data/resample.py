@@ -314,7 +314,8 @@ def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, de
     notes = [f"{name}: the robot responds {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
     notes += [
         f"{name}: the delay is above one period ({robot.period:g} s), but predictions use one earlier input only. If "
-        f"the time stamps are wrong, shift them with --delay {d:.3g}; otherwise choose a longer period."
+        f"the time stamps are wrong, shift them with --delay {d:.3g}. Otherwise, if `certify` finds wide sets, choose "
+        "a longer period."
         for name, d in delays.items()
         if d > 1.01 * robot.period
     ]
