@@ -259,7 +259,7 @@ def test_certify_states_each_error_bound_in_json_in_words_and_with_its_condition
         f"at most {percent(s['bound_plan'])} of plans leave their tube ({s['violations']} did)",
         f"an episode of 300 steps (60 s): at most {300 * s['bound_step']:.2g} steps outside on average",
         f"at least one in up to {percent(s['bound_episode'])} of episodes, if steps are independent",
-        f"an hour of driving (18,000 steps): at most {s['outside_hour']:.3g} steps outside on average",
+        f"an hour of driving (18,000 steps): at most {s['outside_hour']:,.0f} steps outside on average",
         "encoder ticks",
     ):
         assert text in page
