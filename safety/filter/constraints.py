@@ -25,7 +25,7 @@ from brakeline.safety.filter.reservation import ReservationRows, reservation_hal
 from brakeline.safety.filter.state_limits import StateLimits, stack_rows
 from brakeline.safety.filter.tube_extent import stays, widest_extent
 from brakeline.safety.model.model_config import DIRECT
-from brakeline.safety.model.model_set import ModelSet, extra_coordinates
+from brakeline.safety.model.model_set import ModelSet, deciding_coordinates, extra_coordinates
 from brakeline.safety.perception import occluded_regions as shades
 from brakeline.safety.perception import scan_free_space as seen
 
@@ -105,6 +105,7 @@ class TubeConstraints:
         stays: a robot that stands stays where it stands (it does not drift).
         stands: number of periods after which a plan has brought the robot to a stand.
         growth: see `growth_of`.
+        decide (n,): see `deciding_coordinates`.
     """
 
     def __init__(
@@ -133,7 +134,7 @@ class TubeConstraints:
         first, n = model.first, robot.state_dim
         transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
-        self._regressor = model.first_regressor
+        self._regressor, self.decide = model.first_regressor, deciding_coordinates(robot)
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self.measurement_error = float(np.linalg.norm(self.measured))
         if not robot.position_dim:
@@ -239,14 +240,8 @@ class TubeConstraints:
         """Return the predicted set of the next measured state, all coordinates (docs/method.md §2)."""
         tube = self.tube
         first, stretch = (tube.first, float(tube.stretch[0])) if len(tube.first) else (self._unmoved, 1.0)
-        center, half = tube_kernels.next_state(
-            *self._next,
-            self._regressor(z),
-            first,
-            local_map.state_widening * stretch,
-            np.ascontiguousarray(local_map.start),
-            local_map.turn,
-        )
+        factors, start = local_map.state_factors(self.decide) * stretch, np.ascontiguousarray(local_map.start)
+        center, half = tube_kernels.next_state(*self._next, self._regressor(z), first, factors, start, local_map.turn)
         if self.robot.heading is not None:
             center[self.robot.heading] += local_map.heading
         return Prediction(center, half, local_map.heading)

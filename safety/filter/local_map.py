@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
@@ -33,7 +34,13 @@ class LocalMap:
     unseen: OccupiedCells | OccludedRegions | None = None  # space that a scan does not show to be free
     other_reservations: OtherReservations | None = None  # those of other robots
     widening: float = 1.0  # factor on every set of a plan (docs/method.md §15)
-    state_widening: float = 1.0  # factor on the set of the next state
+    # factors on the set of the next state: on the coordinates that decide what is verified, and on the others
+    asked: float = 1.0
+    state_widening: float = 1.0
+
+    def state_factors(self, decide: NDArray[np.bool_]) -> Array:
+        """Return the factors (n,) on the set of the next state. decide (n,): see `deciding_coordinates`."""
+        return np.where(decide, self.asked, self.state_widening)
 
     @property
     def parked(self) -> LocalMap:
@@ -86,8 +93,8 @@ def local_map(
     unseen: OccupiedCells | OccludedRegions | None = occluded
     if isinstance(request.scan, Scan):
         unseen = _unseen(request.scan, start, reach, whole_plan)
-    state_widening = max(request.widening, request.state_widening)
-    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, widening, state_widening)
+    factors = widening, request.widening, max(request.widening, request.state_widening)
+    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, *factors)
 
 
 @cache

@@ -68,7 +68,8 @@ class Request(ComparedByValue):
         other_reservations: the reservations of the other robots.
         observation: the input of a rival's networks; the filter does not need it.
         widening: factor on every set of a plan, at least 1 (docs/method.md §15).
-        state_widening: factor on the set of the next state, if it is larger than `widening`; at least 1.
+        state_widening: factor on the set of the next state, if it is larger than `widening`; at least 1. It widens the
+            coordinates that decide nothing about obstacles and limits, such as speeds. `widening` widens the others.
         past: the last periods of a plan's length; the decision returns their score.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
             it. In joint space there is no space to describe: no request needs it.

@@ -35,9 +35,9 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
     if not request.still(robot):
         return False
     if (predicted := request.predicted) is not None:
-        factor = local_map.state_widening / (start if request.past is None else 1.0)
-        stated = replace(predicted, half_width=predicted.half_width / factor)
-        return factor <= 1.0 or stated.contains(robot, request.state)
+        factors = local_map.state_factors(constraints.decide) / (start if request.past is None else 1.0)
+        stated = replace(predicted, half_width=predicted.half_width / factors)
+        return bool((factors <= 1.0).all()) or stated.contains(robot, request.state)
     constraints = constraints.at(z, start)
     if robot.position_dim:
         centers, half = constraints.sets(local_map.start, local_map.turn, z)

@@ -12,6 +12,7 @@ from shlex import quote
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.acceleration_age import acceleration_age_in
@@ -356,6 +357,19 @@ def extra_coordinates(robot: Robot) -> tuple[int, ...]:
     limited = {i for limit in robot.limits for i, weight in enumerate(limit.weights) if weight and i >= d}
     discs = d * sum(disc.arm > 0.0 for disc in robot.body)
     return (*sorted(limited), *range(n, n + discs))
+
+
+def deciding_coordinates(robot: Robot) -> NDArray[np.bool_]:
+    """Return which coordinates (n,) of a state decide what is verified.
+
+    These are the position, the coordinates with a limit, and the heading of a body with discs beside the position.
+    """
+    decide, extra = np.zeros(robot.state_dim, dtype=bool), extra_coordinates(robot)
+    decide[: robot.position_dim] = True
+    decide[[i for i in extra if i < robot.state_dim]] = True
+    if robot.heading is not None:
+        decide[robot.heading] |= any(i >= robot.state_dim for i in extra)
+    return decide
 
 
 def scored_coordinates(robot: Robot) -> tuple[int, ...]:

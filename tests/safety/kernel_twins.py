@@ -124,7 +124,7 @@ def next_state(C, W_t, M_t, kappa_t, w, widths, z, first, widening, start, turn)
     """`tube_kernels.next_state`."""
     center = first + C @ z
     center[: len(start)] = start + turn @ center[: len(start)]
-    return center, widening * widths @ (magnitudes(W_t, M_t, w, z) + kappa_t.T @ np.abs(z))
+    return center, widening * (widths @ (magnitudes(W_t, M_t, w, z) + kappa_t.T @ np.abs(z)))
 
 
 def hildreth_active_set(h, g, A, b, steps):

@@ -173,7 +173,10 @@ def test_errors_of_speeds_alone_widen_the_set_of_the_next_state_and_not_those_of
     assert list(widening.left) == [False], "the plan stayed in its tube"
     stated, wide = safety.decide(ask), safety.decide(replace(ask, state_widening=widening.state_factor))
     assert (wide.tube_half_width == stated.tube_half_width).all() and wide.margin == stated.margin
-    assert wide.predicted.half_width == pytest.approx(3.0 * RESERVE * stated.predicted.half_width)
+    factors = np.where(
+        np.arange(5) < 2, 1.0, 3.0 * RESERVE
+    )  # a position beyond its stated set has left the plan's, too
+    assert wide.predicted.half_width == pytest.approx(factors * stated.predicted.half_width)
     less = safety.decide(replace(ask, widening=2.0, state_widening=1.5))
     both = safety.decide(replace(ask, widening=2.0))
     assert (less.predicted.half_width == both.predicted.half_width).all(), "as much as those of plans at least"

@@ -28,7 +28,9 @@ class SceneBatch:
     widening: Array
     reach: Array
     far: Array  # (B,): a tube may leave the sensor's range
-    state_widening: Array  # (B,): factor on the set of the next state
+    # asked, state_widening (B,): factors on the set of the next state, as in `LocalMap`
+    asked: Array
+    state_widening: Array
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,7 @@ class LaneDecisions:
         near, beyond = within_reach(xp, obstacles, start, reach, robot.least_margin)
         beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
         far = (widening > 1.0) | self._constraints.base_far
-        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, state_widening)
+        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, asked, state_widening)
         return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
 
     def _factor(self, given: Array | None, requests: RequestArrays, rows: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from brakeline.safety.filter.batch.constraint_batch import ConstraintBatch, PlanBatch, SceneBatch
 from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.reachable_tube import Tube
-from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.model_set import ModelSet, deciding_coordinates
 
 
 class SetBatch:
@@ -24,6 +24,7 @@ class SetBatch:
         self._C, self._W, self._M = constant(first.C[:n]), constant(first.W), constant(first.M)
         self._kappa, self._w = constant(first.kappa), constant(first.w[:, None])
         self._widths = constant(np.abs(first.generators[:n]))
+        self._decide = constant(deciding_coordinates(robot)[:, None].astype(float)) > 0.5
 
     def of_next_state(self, scene: SceneBatch, plan: PlanBatch) -> tuple[Array, Array]:
         """Return the predicted sets of the next measured states: `TubeConstraints.predict` for a batch.
@@ -33,7 +34,8 @@ class SetBatch:
         xp, d = self._xp, self._d
         window = self._regressor @ plan.z
         sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
-        half = (self._widths @ sizes) * (scene.state_widening * plan.path.stretch[0])
+        factors = xp.where(self._decide, scene.asked, scene.state_widening)
+        half = (self._widths @ sizes) * (factors * plan.path.stretch[0])
         center = plan.path.first + self._C @ window
         moved = scene.turn.to_world([center[i] for i in range(d)])
         center[:d] = xp.stack([a + b for a, b in zip(scene.start, moved, strict=True)])

@@ -126,7 +126,7 @@ def extent(
 
 @compiled(
     "Tuple((f8[::1], f8[::1]))"
-    "(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8, f8[::1], f8[:,::1])"
+    "(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1])"
 )
 def next_state(
     C: Array,
@@ -137,14 +137,14 @@ def next_state(
     widths: Array,
     z: Array,
     first: Array,
-    widening: float,
+    widening: Array,
     start: Array,
     turn: Array,
 ) -> tuple[Array, Array]:
     """Return center and half-widths (n,) of the predicted set: bound (1) for one period, position in the world.
 
     C (n, nz), W, M, kappa, w (g,): of the error bound; widths (n, g): absolute values of its generators. first (n,):
-    prediction of a predictor that is not linear, or zeros. widening: factor on the set.
+    prediction of a predictor that is not linear, or zeros. widening (n,): factors on the half-widths.
     """
     n, d, sizes = len(C), len(start), magnitudes(W_t, M_t, w, z)
     _add_product(kappa_t, np.abs(z), sizes)
@@ -154,7 +154,7 @@ def next_state(
         for j in range(len(z)):
             center[i] += C[i, j] * z[j]
         for j in range(len(sizes)):
-            half[i] += widths[i, j] * sizes[j] * widening
+            half[i] += widths[i, j] * sizes[j] * widening[i]
     for axis in range(d):
         for other in range(d):
             moved[axis] += turn[axis, other] * center[other]
