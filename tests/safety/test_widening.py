@@ -173,9 +173,8 @@ def test_errors_of_speeds_alone_widen_the_set_of_the_next_state_and_not_those_of
     assert list(widening.left) == [False], "the plan stayed in its tube"
     stated, wide = safety.decide(ask), safety.decide(replace(ask, state_widening=widening.state_factor))
     assert (wide.tube_half_width == stated.tube_half_width).all() and wide.margin == stated.margin
-    factors = np.where(
-        np.arange(5) < 2, 1.0, 3.0 * RESERVE
-    )  # a position beyond its stated set has left the plan's, too
+    # A robot whose position is beyond its stated set has left its plan's tube: it must not be in the predicted set.
+    factors = np.where(np.arange(5) < 2, 1.0, 3.0 * RESERVE)
     assert wide.predicted.half_width == pytest.approx(factors * stated.predicted.half_width)
     less = safety.decide(replace(ask, widening=2.0, state_widening=1.5))
     both = safety.decide(replace(ask, widening=2.0))
