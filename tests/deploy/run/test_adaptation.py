@@ -273,9 +273,9 @@ def test_an_update_of_the_set_in_use_holds_on_fresh_driving():
 def test_an_update_whose_rollouts_diverge_leaves_every_set():
     """Infinity divided by infinity is no number, and no number is above 1."""
     s = samples_of(Dataset(ROBOT, driven(2, 2)).joined())
+    shapes = s.after.shape[1:], s.after.shape[1:2]
     without_end = SimpleNamespace(
-        rollouts=lambda robot, z: np.full((len(z), *s.after.shape[1:]), np.inf),
-        stretches=lambda robot, z: np.full((len(z), s.after.shape[1]), np.inf),
+        rollouts_with_stretch=lambda robot, z: tuple(np.full((len(z), *shape), np.inf) for shape in shapes)
     )
     correction = SimpleNamespace(gram=range(int(s.fold.max()) + 1), fit=lambda *choice, without: without_end)
     widths = np.ones((*s.after.shape[:2], s.after.shape[2] + 1))
@@ -286,7 +286,8 @@ def test_an_update_whose_rollouts_diverge_leaves_every_set():
 def share_outside(model, data):
     """The share of windows that leave the sets of positions."""
     s = samples_of(data.joined())
-    errors = (s.after - model.one_step.rollouts(ROBOT, s.z)) / model.one_step.stretches(ROBOT, s.z)[..., None]
+    predicted, stretch = model.one_step.rollouts_with_stretch(ROBOT, s.z)
+    errors = (s.after - predicted) / stretch[..., None]
     half_widths = np.stack([step.half_widths(s.z) for step in model.steps], 1)
     return float((np.abs(errors) > half_widths)[..., : ROBOT.position_dim].any((1, 2)).mean())
 
