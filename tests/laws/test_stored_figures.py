@@ -148,6 +148,8 @@ def test_the_pages_say_how_many_steps_sac_needs_at_the_same_learning_rate(name: 
 OTHERS = {  # rows of the table of other settings, with the folder and the method of their cells
     "TD3, 300,000 steps": ("plateau/quadrotor", "none"),
     "SAILR, η = 0.15, 300,000 steps": ("plateau/quadrotor", "sailr"),
+    "SECAS, 300,000 steps": ("plateau/quadrotor", "secas"),
+    "PSF, 300,000 steps": ("plateau/quadrotor", "psf"),
     "SAILR, η = 0.15": ("former_settings/quadrotor", "sailr"),
     "CBF-QP, α = 2": ("former_settings/quadrotor", "cbf"),
     "SECAS, margin 0.4 m": ("former_settings/quadrotor", "secas"),
