@@ -58,7 +58,7 @@ def ratio(
     if crossed and len({len(a) for a, _ in pairs}) > 1:
         raise ValueError("seeds with the same episodes have the same number of them")
     # how often each episode was drawn
-    counts = [_drawn_for_all(len(a), seed, rng) if crossed else _drawn(len(a), rng) for a, _ in pairs]
+    counts = [_drawn_for_all(len(a), seed, rng) if crossed else _drawn(len(a), rng, RESAMPLES) for a, _ in pairs]
     resampled = np.stack([(drawn @ a) / (drawn @ b) for (a, b), drawn in zip(pairs, counts, strict=True)])
     shape = len(pairs), RESAMPLES  # of the seeds drawn
     # Without common episodes, draw them independently for each seed, also if a seed is drawn twice.
@@ -87,19 +87,19 @@ def rate(happened: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimat
     return replace(estimate, low=low, high=high)
 
 
-def _drawn(episodes: int, rng: np.random.Generator) -> Array:
-    """Return how often each episode is drawn, (RESAMPLES, episodes)."""
-    return np.asarray(rng.multinomial(episodes, np.full(episodes, 1.0 / episodes), size=RESAMPLES), float)
+def _drawn(episodes: int, rng: np.random.Generator, resamples: int) -> Array:
+    """Return how often each episode is drawn, (resamples, episodes)."""
+    return np.asarray(rng.multinomial(episodes, np.full(episodes, 1.0 / episodes), size=resamples), float)
 
 
 def _drawn_for_all(episodes: int, seed: int, rng: np.random.Generator) -> Array:
     """Return the first draw of `rng`, which was made from `seed`: a table draws the same one hundreds of times."""
-    drawn, rng.bit_generator.state = _first_draw(episodes, seed)
+    drawn, rng.bit_generator.state = _first_draw(episodes, seed, RESAMPLES)
     return drawn
 
 
 @lru_cache(maxsize=4)
-def _first_draw(episodes: int, seed: int) -> tuple[Array, Mapping[str, Any]]:
+def _first_draw(episodes: int, seed: int, resamples: int) -> tuple[Array, Mapping[str, Any]]:
     """Return the first draw from a seed, and the generator's state after it."""
     rng = np.random.default_rng(seed)
-    return _drawn(episodes, rng), rng.bit_generator.state
+    return _drawn(episodes, rng, resamples), rng.bit_generator.state

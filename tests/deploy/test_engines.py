@@ -129,7 +129,7 @@ def test_compose_file_matches_the_schema():
 @pytest.mark.parametrize(("done", "status"), [(True, 0), (False, 130)])
 def test_a_learner_that_is_stopped_before_its_last_step_has_not_succeeded(monkeypatch, done, status):
     """Before, a drained node ended the Job of a run as if its training were complete."""
-    monkeypatch.setattr(learner_process, "main", lambda _: done)
+    monkeypatch.setattr(learner_process, "learn", lambda _: (done, ""))
     assert main(["learner", "ground", "--listen", "tcp/127.0.0.1:0"]) == status
 
 

@@ -157,7 +157,7 @@ def test_an_attitude_error_displaces_a_sensor_on_a_mast():
     at = tilt @ mount
     towards = np.maximum(ways[..., 0], 1e-9)
     ranges = np.minimum((ahead - at[0]) / towards, FAR)
-    known = {"far": FAR, "range_error": 0.0, "angle_error": error, "least_width": 50.0}
+    known = {"far": FAR, "range_error": 0.0, "angle_error": error, "least_width": 5.0}
     image = RangeImage(ranges, (0.0, 0.0, 0.0), low=-edge, high=edge, mount=mount, **known)
     nominal = np.linspace(0.0, 1.0, 9)[1:, None] * np.asarray(mount)
     seen = occluded_regions(image, room(4.0, 1.0), 0.0, ORIGIN)
