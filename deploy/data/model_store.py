@@ -129,7 +129,7 @@ def _load_or_build(path: Path, load: Callable[[], M], build: Callable[[], M], ac
         except BadModel as error:
             if path.exists():
                 aside = _copy_aside(path)  # somebody may want to know what it was
-                console.print(f"[yellow]{activity} again:[/] {error}; the file before is in {aside}, too")
+                console.print(f"[yellow]{activity} again:[/] {error}; a copy of the file before is in {aside}")
         return build()
 
 

@@ -35,12 +35,12 @@ class LocalMap:
     other_reservations: OtherReservations | None = None  # those of other robots
     widening: float = 1.0  # factor on every set of a plan (docs/method.md §15)
     # factors on the set of the next state: on the coordinates that decide what is verified, and on the others
-    asked: float = 1.0
+    asked_widening: float = 1.0
     state_widening: float = 1.0
 
     def state_factors(self, decide: NDArray[np.bool_]) -> Array:
         """Return the factors (n,) on the set of the next state. decide (n,): see `deciding_coordinates`."""
-        return np.where(decide, self.asked, self.state_widening)
+        return np.where(decide, self.asked_widening, self.state_widening)
 
     @property
     def parked(self) -> LocalMap:

@@ -28,8 +28,8 @@ class SceneBatch:
     widening: Array
     reach: Array
     far: Array  # (B,): a tube may leave the sensor's range
-    # asked, state_widening (B,): factors on the set of the next state, as in `LocalMap`
-    asked: Array
+    # asked_widening, state_widening (B,): factors on the set of the next state, as in `LocalMap`
+    asked_widening: Array
     state_widening: Array
 
 

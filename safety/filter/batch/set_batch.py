@@ -34,7 +34,7 @@ class SetBatch:
         xp, d = self._xp, self._d
         window = self._regressor @ plan.z
         sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
-        factors = xp.where(self._decide, scene.asked, scene.state_widening)
+        factors = xp.where(self._decide, scene.asked_widening, scene.state_widening)
         half = (self._widths @ sizes) * (factors * plan.path.stretch[0])
         center = plan.path.first + self._C @ window
         moved = scene.turn.to_world([center[i] for i in range(d)])

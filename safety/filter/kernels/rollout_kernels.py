@@ -189,8 +189,8 @@ def rollout(predictor: Predictor, across: Array, weight: float, z: Array) -> tup
 
 
 @compiled("f8[::1](f8[:,::1], f8[::1])")
-def _product_with(T: Array, z: Array) -> Array:
-    """Return T z, summed in the order of the columns."""
+def _window_of(T: Array, z: Array) -> Array:
+    """Return the window T z, summed in the order of the columns."""
     window = np.zeros(len(T))
     for i in range(len(T)):
         for j in range(len(z)):
@@ -235,7 +235,7 @@ def affine(predictor: Predictor, z: Array, T: Array, further: Index) -> tuple[Ar
     Returns:
         Gradient (N, d, nz) and offset (N, d) of the positions, and the same of the further coordinates.
     """
-    outputs, gradient = linearized(predictor, _product_with(T, z), T)
+    outputs, gradient = linearized(predictor, _window_of(T, z), T)
     N, nz, k, d = len(outputs), len(z), len(further), predictor[7]
     position, offset = np.empty((N, d, nz)), np.empty((N, d))
     more, more_offset = np.empty((N, k, nz)), np.empty((N, k))
@@ -276,7 +276,7 @@ def sets_around(
         Positions (N, d) and their generators (N, d, L), the same of the further coordinates, all coordinates after one
         period (n,), and the factors (N,) that the generators hold.
     """
-    outputs, wider = rollout(predictor, across, weight, _product_with(T, z))
+    outputs, wider = rollout(predictor, across, weight, _window_of(T, z))
     (N, d, _), k = directions.shape, len(further)
     centers, wide, more, more_wide = (
         np.empty((N, d)),
