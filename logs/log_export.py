@@ -7,7 +7,7 @@ import math
 import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -29,6 +29,9 @@ BATCH = 1000  # messages per write
 EPISODES_AT_ONCE = 100  # episodes per write of a Minari data set
 # Fields of a step in the `infos` of a Minari data set.
 INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weights_version")
+# Columns of a CSV file about the decision of a step, besides its kind.
+DECISION_FIELDS = ("decision.verified", "decision.margin", "decision.model", "decision.reason")
+MOST_WAITING = 1_000  # exchanges in memory whose step has not come
 TIME = struct.Struct(">Q")  # of a frame in a .tlog file: µs since the Unix epoch
 
 
@@ -55,7 +58,7 @@ def robot_of_log(log: Log, name: str) -> Robot:
     return robot if robot is not None else robot_maybe_with_task(wanted)
 
 
-def robot_steps(log: Log, robot: Robot) -> Iterator[Record]:
+def robot_steps(log: Iterable[Record], robot: Robot) -> Iterator[Record]:
     """Yield the steps of a robot kind in the order of receipt.
 
     Raises:
@@ -80,8 +83,10 @@ def robot_steps(log: Log, robot: Robot) -> Iterator[Record]:
 def to_csv(log: Log, robot: Robot, file: TextIO) -> int:
     """Write each step of a robot kind as a line, and return the number of steps. Raises as `robot_steps`.
 
-    Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, and the fields of the message
-    but `path`; vectors as `field.name [unit]`, the decision by its name. A robot without a task has no observations.
+    Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, the fields of the message
+    but `path`, and `DECISION_FIELDS` of the decision that the step followed; vectors as `field.name [unit]`, the
+    decision by its name. A robot without a task has no observations. Without requests in the log, `DECISION_FIELDS`
+    are empty.
     """
     observed = robot.task.observed if isinstance(robot, RobotWithTask) else ()
     vectors = {
@@ -92,9 +97,9 @@ def to_csv(log: Log, robot: Robot, file: TextIO) -> int:
     header = ["time", "source", "run", "sequence"]
     table = csv.writer(file, lineterminator="\n")
     titles = [f"{name}.{part}" for name, parts in vectors.items() for part in parts]
-    table.writerow(["log_time", *(f"header.{name}" for name in header), *plain, *titles])
+    table.writerow(["log_time", *(f"header.{name}" for name in header), *plain, *titles, *DECISION_FIELDS])
     count = 0
-    for record in robot_steps(log, robot):
+    for record, exchange in _steps_with_exchanges(log, robot):
         step = record.message
         values: list[Any] = [record.log_time, *(getattr(step.header, name) for name in header)]
         for name in plain:
@@ -105,9 +110,36 @@ def to_csv(log: Log, robot: Robot, file: TextIO) -> int:
         for name, parts in vectors.items():
             row = list(getattr(step, name))
             values += row if len(row) == len(parts) else [""] * len(parts)
-        table.writerow(values)
+        table.writerow([*values, *_decision_values(exchange)])
         count += 1
     return count
+
+
+def _steps_with_exchanges(log: Log, robot: Robot) -> Iterator[tuple[Record, pb.Exchange | None]]:
+    """Yield the steps of a robot kind, each with the exchange about it, which comes before its step in a log."""
+    exchanges: dict[tuple[int, str, int, int], pb.Exchange] = {}
+
+    def watched() -> Iterator[Record]:
+        for record in log:
+            if record.topic == "exchange" and (request := record.message.request).robot == robot.name:
+                if len(exchanges) == MOST_WAITING:  # of steps that never came
+                    del exchanges[next(iter(exchanges))]
+                exchanges[record.message.header.run, request.actor, request.episode, request.step] = record.message
+            yield record
+
+    for record in robot_steps(watched(), robot):
+        step = record.message
+        yield record, exchanges.pop((step.header.run, step.actor, step.episode, step.step), None)
+
+
+def _decision_values(exchange: pb.Exchange | None) -> list[Any]:
+    """Return the values of `DECISION_FIELDS`, empty without an exchange. If no decision came, the reason says why."""
+    if exchange is None:
+        return [""] * len(DECISION_FIELDS)
+    if exchange.failure:
+        return [*[""] * (len(DECISION_FIELDS) - 1), exchange.failure]
+    decision = exchange.reply.decision
+    return [int(decision.verified), decision.margin, decision.model, decision.reason]
 
 
 def to_tlog(log: Log, file: BinaryIO) -> int:

@@ -45,6 +45,16 @@ def test_csv_has_every_step_with_every_field(log, tmp_path, figures) -> None:
             ("state", GROUND.state),
         ):
             assert [float(row[f"{name}.{part}"]) for part in parts] == list(getattr(step, name)), name
+    asked = [message for topic, message, _ in messages(log) if topic.startswith("exchange/")]
+    decisions = {(str(e.request.episode), str(e.request.step)): e.reply.decision for e in asked}
+    assert any(decision.reason for decision in decisions.values())
+    for row in rows:
+        decision = decisions[row["episode"], row["step"]]
+        assert [bool(int(row["decision.verified"])), float(row["decision.margin"])] == [
+            decision.verified,
+            decision.margin,
+        ]
+        assert [row["decision.model"], row["decision.reason"]] == [decision.model, decision.reason]
     missing = {f.name for f in pb.Step.DESCRIPTOR.fields} - {name.split(".")[0] for name in rows[0]}
     assert missing == {"path"}
 
