@@ -26,7 +26,7 @@ from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 SAMPLES = 5  # of the position in a period
 # Standard deviation of an error in the trials, and at most, as a share of the half-width of the set after one period.
 # In the first flights of an ArduCopter and a PX4, the shares were 0.11 to 0.25, by coordinate. A policy that learned
-# with 0.25 flew worse than one with 0.15 (docs/your_px4.md).
+# with 0.25 flew worse than one with 0.15 (docs/autopilot_flights.md).
 TRIED_ERROR, LARGEST_ERROR = 0.05, 0.15
 CUT = 0.95  # largest single error, as a share of the same half-width
 TRIALS = 500  # simulated stops, which decide how large the errors are
