@@ -107,6 +107,11 @@ class RosInputs:
             self._commands += 1
             self._command = RawCommand(np.array([twist.linear.x, twist.angular.z]), now, self._commands)
 
+    def executed(self, action: Array, now: float) -> None:
+        """Note that the robot executes an input (2,) from now [s] on."""
+        with self._lock:
+            self._odometry.executed(now, *action.tolist())
+
     def forget(self) -> None:
         """Drop everything with a time stamp, since the clock was set."""
         with self._lock:

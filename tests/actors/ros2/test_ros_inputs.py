@@ -1,6 +1,7 @@
 """The inputs of a decision, from scans, odometry and transforms, and the reasons for which they are missing."""
 
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -205,6 +206,26 @@ def test_a_robot_brakes_in_a_gap_so_a_pose_that_is_far_away_after_it_is_a_jump(g
     inputs.on_odometry(odometry(10.0 + gap, x, 0.0, heading))
     with pytest.raises(PoseJumped, match=rf"the pose jumped by .* within {gap:.2f} s"):
         inputs.state(10.0 + gap, 10.0 + gap)
+
+
+@pytest.mark.parametrize("gap", [0.5, 60.0])
+@pytest.mark.parametrize(("stood", "x", "heading", "jumps"), [
+    (True, 0.1, 0.0, True), (True, 0.05, 0.05, False), (True, 0.0, 0.1, True),
+    (False, 0.5, 0.0, True), (False, 0.2, 0.3, False),
+])  # fmt: skip
+def test_in_a_gap_a_robot_moves_no_farther_than_its_inputs(gap, stood, x, heading, jumps):
+    """Before, a robot that stood could find itself 63 cm away after its odometry had begun anew."""
+    inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose()), AgeLimits())
+    speed = np.array([0.0, 0.0] if stood else [0.25, 0.5])
+    inputs.executed(speed, 8.0)
+    for i in range(3):
+        inputs.on_odometry(odometry(9.9 + 0.05 * i))
+    inputs.executed(0.5 * speed, 10.3)
+    inputs.executed(np.zeros(2), 10.45)
+    inputs.on_odometry(odometry(10.0 + gap, x, 0.0, heading))
+    inputs.on_odometry(odometry(10.05 + gap, x, 0.0, heading))
+    with pytest.raises(PoseJumped, match="can't have done") if jumps else nullcontext():
+        inputs.state(10.05 + gap, 10.05 + gap)
 
 
 def test_odometry_in_another_frame_is_refused_and_both_are_named():
