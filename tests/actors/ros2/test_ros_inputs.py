@@ -228,6 +228,32 @@ def test_in_a_gap_a_robot_moves_no_farther_than_its_inputs(gap, stood, x, headin
         inputs.state(10.05 + gap, 10.05 + gap)
 
 
+@pytest.mark.parametrize("transforms", [False, True])
+def test_odometry_of_a_robot_that_leans_does_not_count_until_it_stands_upright(transforms):
+    """As on its side, or from a driver that counts its angles otherwise."""
+    settings = SensorSettings(mount=PlanarPose(), base_frame="base_footprint" if transforms else "")
+    inputs = RosInputs(ROBOT, settings, AgeLimits())
+
+    def measure(at, lean):
+        turn = cdr.Quaternion(x=math.sin(0.5 * lean), y=0.0, z=0.0, w=math.cos(0.5 * lean))
+        message = odometry(at)
+        message.pose.pose.orientation = turn
+        moved = cdr.TFMessage(transforms=[transform("odom", "base_footprint", rotation=turn, at=at)])
+        inputs.on_transforms(moved) if transforms else inputs.on_odometry(message)
+
+    for k in range(8):
+        measure(9.8 + 0.02 * k, 0.3)
+    assert inputs.state(9.93, 9.95) is not None, "a ramp"
+    for lean in (0.35, 1.57, -math.pi):
+        measure(9.96, lean)
+        with pytest.raises(
+            InputMissing, match=rf"leans by {abs(math.degrees(lean)):.0f}° against 'odom': .* at most 18°"
+        ):
+            inputs.state(9.95, 9.97)
+    measure(9.96, 0.0)
+    assert inputs.state(9.95, 9.97) is not None
+
+
 def test_odometry_in_another_frame_is_refused_and_both_are_named():
     inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose(), odometry_frame="/odom"), AgeLimits())
     for frame in ("map", ""):
