@@ -109,13 +109,12 @@ class BatchRobots:
             cut = self._outcome.decided & (self._outcome.answers.kind == KINDS.index(FAILSAFE))
             penalty = np.where(cut, np.maximum(rewards - self._robot.task.reward.cut, 0.0), 0.0)
         ended = terminated | truncated
-        decided = False if self._outcome is None else self._outcome.decided[:, None]
         columns: dict[str, Any] = {
             "episode": episodes,
             "step": steps,
             "index": index,
             "observation": seen,
-            "proposed": np.where(decided | self._finite, self._proposals, self._inputs),
+            "proposed": np.where(self._finite, self._proposals, self._inputs),
             "action": self._inputs,
             "next_observation": infos.get("final_obs", self.observations),
             "reward": rewards,

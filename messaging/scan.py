@@ -113,7 +113,7 @@ class Scan(ComparedByValue):
     Attributes:
         ranges: (R,) [m]. `far` means no hit; 0 or NaN means no information.
         angles: (R,) in the sensor's frame, ascending, over less than a turn [rad].
-        pose: measured pose of the robot at the time of the scan: x, y [m], heading [rad].
+        pose: measured pose of the robot at the time of the scan: x, y [m], heading [rad], in the frame of the state.
         mount: position of the sensor in the robot's frame [m].
         far: largest range of the sensor [m].
         range_error: largest error of a range [m].

@@ -181,6 +181,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 state, proposed, near, scan=self._scan, observation=observation, known_free=known_free
             )
             if answer.bound is not None and answer.bound > self._limit:
+                self._plan = self.backup_plan.plan  # ours: the next step raises the same error
                 raise TooLoose(
                     f"{self.client.robot.name}: the service's model set {answer.model} states only that at most "
                     f"{percent(answer.bound)} of plans leave their tubes; accept_bound is {percent(self._limit)}"

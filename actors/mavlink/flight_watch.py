@@ -5,13 +5,19 @@ from __future__ import annotations
 import math
 from collections import deque
 
+import numpy as np
+
 from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
-from brakeline.actors.mavlink.mavlink_decoder import MavlinkDecoder
-from brakeline.actors.mavlink.telemetry import IN_FLIGHT, MOTION, unknown_quantities
+from brakeline.actors.mavlink.mavlink_decoder import JUMP, MavlinkDecoder
+from brakeline.actors.mavlink.telemetry import IN_FLIGHT, MOTION, Array, unknown_quantities
 
 POLL = 0.005  # s between two reads of the link
 STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
 SILENT = 3.0  # s without a heartbeat after which the mode counts as unknown
+COAST = (
+    2.0  # s, for which a vehicle may fly on at its last velocity: until its autopilot's timeout, and while it brakes
+)
+DRIFT = 0.1  # m/s, of a vehicle that hovers
 MOST_REQUESTS = 10  # for the autopilot's clock, to which a reply still counts
 
 
@@ -25,20 +31,42 @@ class FlightWatch:
         # ns, our clock at our requests for the autopilot's
         self._clock_requests: deque[int] = deque(maxlen=MOST_REQUESTS)
         self._offsets = ClockOffset()
+        self._noted_at = math.inf  # s, time of the last call of `note`
+        self._before: Array | None = None  # (3,) m, the latest position
+        self._reach = 0.0  # m, the way that the vehicle can have flown since then
 
-    def note(self, now: float) -> None:
-        """Take in what the client has received up to `now` [s]."""
+    def note(self, now: float, setpoint: float = 0.0) -> None:
+        """Take in what the client has received up to `now` [s]. setpoint: the speed that we command [m/s]."""
         client, timing = self._client, self._timing
+        self._reach += setpoint * max(now - self._noted_at, 0.0)
+        self._noted_at = now
         for what, count in client.message_counts.items():
             if self._counted.get(what) != count:
-                self._counted[what], self._received_at[what] = count, now
                 if what == MOTION:
                     self._offsets.note(now, client.time)
+                    self._note_position(now - self._received_at.get(what, now))
+                self._counted[what], self._received_at[what] = count, now
         for asked, theirs in client.clock_answers:
             if asked in self._clock_requests:  # other stations ask, too
                 timing.round_trip = min(timing.round_trip, now - 1e-9 * asked)
                 self._offsets.answer(1e-9 * asked, 1e-9 * theirs, timing.round_trip)
         client.clock_answers.clear()
+
+    def _note_position(self, silent: float) -> None:
+        """Take in the latest position. End our command if the vehicle cannot have flown there.
+
+        Without positions the vehicle brakes along the committed plan, and then hovers. So the setpoints and its last
+        velocity limit its way, however long a gap is: a position farther away is in another frame.
+
+        silent: s since the position before arrived.
+        """
+        client = self._client
+        if silent > STALE and self._before is not None and client.position is not None:
+            moved = float(np.linalg.norm(client.position - self._before))
+            if not moved <= JUMP + DRIFT * silent + self._reach:
+                why = f"its position jumped by {moved:.2f} m in a gap of {silent:.2f} s, farther than it can have flown"
+                client.interruption = client.interruption or why
+        self._before, self._reach = client.position, COAST * float(np.linalg.norm(client.velocity))
 
     def clock_requested(self, nanoseconds: int) -> None:
         """Note a request for the autopilot's clock at this time of ours [ns]."""

@@ -329,7 +329,7 @@ class MavlinkVehicle(PeriodicVehicle):
         for peer, data in self._link.receive_by_peer():
             with self._rejected.skip_on_error("mavlink"):
                 client.feed(data, peer)
-        self._watch.note(now)
+        self._watch.note(now, 0.0 if self._velocity is None else float(np.linalg.norm(self._velocity)))
         self._remember_acceleration(now)
         if self._mavlink_truth is not None and client.truth is not None and client.position is not None:
             self._mavlink_truth.take(client.truth, client.position + self._origin, client.velocity)

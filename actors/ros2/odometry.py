@@ -18,6 +18,7 @@ SAME_TIME = 1e-4  # s: odometry that is not newer by more is dropped
 SPEED_WINDOW = 0.1  # s over which speeds are computed from poses without speeds
 FASTER = 2.0  # than its inputs allow, a robot may move between two odometries, as downhill or with a late stamp
 LARGER_ERRORS = 4.0  # than one measurement's, the errors of two odometries may be together
+MOST_INPUTS = 64  # that are remembered: a robot that brakes changes its input a few times, and then stands
 TIME, X, Y, HEADING = range(4)  # columns of a row; speed [m/s] and turn rate [rad/s] follow
 
 
@@ -25,8 +26,9 @@ TIME, X, Y, HEADING = range(4)  # columns of a row; speed [m/s] and turn rate [r
 class StepLimits:
     """The largest step between two odometries: rates in m/s and rad/s, plus an allowance in m and rad for errors.
 
-    Without odometry a robot brakes. So it moves for `braking` seconds at most, however long a gap is: a pose farther
-    away comes from a sender that has restarted meanwhile.
+    Without odometry a robot brakes. So it moves for `braking` seconds at most, however long a gap is, and no farther
+    than its inputs meanwhile: a pose farther away comes from a sender that has restarted. An input acts for `settling`
+    seconds after the next one has replaced it.
     """
 
     speed: float
@@ -34,19 +36,28 @@ class StepLimits:
     position: float
     heading: float
     braking: float
+    settling: float
 
     @staticmethod
     def of(robot: Robot, gap: float = LONGEST_GAP) -> StepLimits:
         """Return the limits of a robot that drives in the plane by speed and turn rate. gap: see `OdometryHistory`."""
         speed, turn_rate = (FASTER * float(most) for most in np.maximum(np.abs(robot.low()), np.abs(robot.high())))
         x, y, heading = (LARGER_ERRORS * robot.measurement_bound[i] for i in range(3))
-        return StepLimits(speed, turn_rate, math.hypot(x, y), heading, gap + (robot.horizon + 1) * robot.period)
+        braking, settling = robot.horizon + 1, robot.horizon - robot.free_steps  # periods
+        return StepLimits(
+            speed, turn_rate, math.hypot(x, y), heading, gap + braking * robot.period, settling * robot.period
+        )
 
-    def allow(self, duration: float, distance: float, turn: float) -> bool:
-        """Return whether a robot can move so far [m], and turn so far [rad], in a time [s]."""
+    def allow(
+        self, duration: float, distance: float, turn: float, way: float = math.inf, arc: float = math.inf
+    ) -> bool:
+        """Return whether a robot can move so far [m], and turn so far [rad], in a time [s].
+
+        way [m], arc [rad]: of the inputs in this time; infinite if they are not known.
+        """
         moving = min(duration, self.braking)
-        far = distance > self.position + self.speed * moving
-        return not (far or turn > self.heading + self.turn_rate * moving)
+        far = distance > self.position + min(self.speed * moving, FASTER * way)
+        return not (far or turn > self.heading + min(self.turn_rate * moving, FASTER * arc))
 
 
 class OdometryHistory:
@@ -60,6 +71,7 @@ class OdometryHistory:
     def __init__(self, limits: StepLimits, gap: float = LONGEST_GAP) -> None:
         """limits: the largest step between two odometries. gap: s, the longest time between them."""
         self._rows: deque[tuple[float, ...]] = deque()
+        self._inputs: deque[tuple[float, float, float]] = deque(maxlen=MOST_INPUTS)  # see `executed`
         self._limits, self._gap = limits, gap
         self.jump = ""
 
@@ -67,6 +79,11 @@ class OdometryHistory:
     def newest(self) -> float:
         """Time of the newest odometry [s]; -inf without any."""
         return self._rows[-1][TIME] if self._rows else -math.inf
+
+    def executed(self, time: float, speed: float, turn_rate: float) -> None:
+        """Note that the robot executes an input, [m/s] and [rad/s], from a time [s] on."""
+        if not self._inputs or self._inputs[-1][1:] != (abs(speed), abs(turn_rate)):
+            self._inputs.append((time, abs(speed), abs(turn_rate)))
 
     def add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> None:
         """Add an odometry, unless a number is not finite, or it is not newer than the last one.
@@ -128,12 +145,22 @@ class OdometryHistory:
         if self._rows:
             last, duration = self._rows[-1], time - self.newest
             distance, turn = math.hypot(x - last[X], y - last[Y]), abs(wrap(heading - last[HEADING]))
-            if not self._limits.allow(duration, distance, turn):
+            inputs = self._inputs_between(self.newest, time) if duration > self._gap else (math.inf, math.inf)
+            if not self._limits.allow(duration, distance, turn, *inputs):
                 self._begin_anew(
                     f"the pose jumped by {distance:.2f} m and {turn:.2f} rad within {duration:.2f} s, "
-                    "which this robot can't do"
+                    "which this robot can't have done"
                 )
         return True
+
+    def _inputs_between(self, since: float, until: float) -> tuple[float, float]:
+        """Return the way [m] and the arc [rad] of the inputs between two times [s]; infinite if one is not known."""
+        since -= self._limits.settling
+        if not self._inputs or self._inputs[0][0] > since:
+            return math.inf, math.inf
+        times, *rates = np.array(self._inputs).T
+        spans = np.diff(np.clip(np.append(times, until), since, until))
+        return float(spans @ rates[0]), float(spans @ rates[1])
 
     def _begin_anew(self, why: str) -> None:
         self._rows.clear()

@@ -221,9 +221,9 @@ class FilterNode:
         return clock.wait(moment, stop, SILENCE)
 
     def _send(self, action: Array) -> None:
-        message = twist(*map(float, action))
-        stamped = self.settings.stamped
-        self._commands.put(TwistStamped(header=header(self.clock.now(), ""), twist=message) if stamped else message)
+        message, now = twist(*map(float, action)), self.clock.now()
+        self.inputs.executed(action, now)
+        self._commands.put(TwistStamped(header=header(now, ""), twist=message) if self.settings.stamped else message)
 
     def _diagnose(self) -> None:
         """Publish diagnostics every second and when the decision changes; log a change of its kind."""

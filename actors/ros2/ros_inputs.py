@@ -20,6 +20,7 @@ from brakeline.actors.ros2.sensor_frames import (
     TransformTree,
     frame_name,
     pose_of,
+    tilt_of,
 )
 from brakeline.actors.ros2.unknown_space import UnknownSpace
 from brakeline.errors import BadScan, InputMissing, PoseJumped
@@ -59,7 +60,7 @@ class RosInputs:
         self._commands = 0
 
     def on_odometry(self, message: Odometry) -> None:
-        """Handle odometry; in another frame it counts as missing until the next one in the right frame."""
+        """Handle odometry; in another frame, or of a body that leans, it counts as missing until the next good one."""
         pose, twist = message.pose.pose, message.twist.twist
         frame = headline(message.header.frame_id, LONGEST_FRAME)
         if frame_name(frame) != frame_name(self.frame):
@@ -67,7 +68,8 @@ class RosInputs:
                 self._bad_odometry = f"the odometry is in frame {frame!r}, not in {self.frame!r} (see --odometry-frame)"
             return
         with self._lock:
-            self._bad_odometry = ""
+            if not self._stands_upright(tilt_of(pose.orientation)):
+                return
             self._base = headline(message.child_frame_id, LONGEST_FRAME) or self._base
             self._odometry.add(
                 seconds(message.header.stamp),
@@ -81,9 +83,20 @@ class RosInputs:
         for stamped in message.transforms:
             frames = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
             pose = pose_of(stamped.transform) if frames == wanted else None
-            if pose is not None and pose.tilt <= MOST_LEAN:
-                with self._lock:
+            if pose is None:
+                continue
+            with self._lock:
+                if self._stands_upright(pose.tilt):
                     self._odometry.add_pose(seconds(stamped.header.stamp), pose.x, pose.y, pose.yaw)
+
+    def _stands_upright(self, tilt: float) -> bool:
+        """Return whether a body that leans by an angle [rad] drives in the plane. If not, its odometry is missing."""
+        upright, most = not tilt > MOST_LEAN, math.degrees(MOST_LEAN)  # what holds NaN is dropped later
+        lean = (
+            f"the robot leans by {math.degrees(tilt):.0f}° against {self.frame!r}: it may lean by at most {most:.0f}°"
+        )
+        self._bad_odometry = "" if upright else lean
+        return upright
 
     def on_fixed_transforms(self, message: TFMessage) -> None:
         with self._lock:
@@ -106,6 +119,11 @@ class RosInputs:
         with self._lock:
             self._commands += 1
             self._command = RawCommand(np.array([twist.linear.x, twist.angular.z]), now, self._commands)
+
+    def executed(self, action: Array, now: float) -> None:
+        """Note that the robot executes an input (2,) from now [s] on."""
+        with self._lock:
+            self._odometry.executed(now, *action.tolist())
 
     def forget(self) -> None:
         """Drop everything with a time stamp, since the clock was set."""

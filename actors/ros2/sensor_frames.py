@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from brakeline.messaging.ros2.cdr_messages import Transform, TransformStamped, yaw_of
+from brakeline.messaging.ros2.cdr_messages import Quaternion, Transform, TransformStamped, yaw_of
 
 MOST_TILT = math.radians(3.0)  # of a lidar against the robot
 MOST_LEAN = math.radians(18.0)  # of a robot against the frame of its odometry, as on a ramp
@@ -41,10 +41,14 @@ class PlanarPose:
         return PlanarPose(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, -self.yaw, self.tilt)
 
 
+def tilt_of(q: Quaternion) -> float:
+    """Return the angle [rad] between the vertical axis and the one that a rotation turns it to."""
+    return 2.0 * math.atan2(math.hypot(q.x, q.y), math.hypot(q.z, q.w))
+
+
 def pose_of(transform: Transform) -> PlanarPose | None:
     """Return a transform as a pose in the plane; None: it has numbers that are not finite."""
-    q, t = transform.rotation, transform.translation
-    yaw, tilt = yaw_of(q), 2.0 * math.atan2(math.hypot(q.x, q.y), math.hypot(q.z, q.w))
+    t, yaw, tilt = transform.translation, yaw_of(transform.rotation), tilt_of(transform.rotation)
     return PlanarPose(t.x, t.y, yaw, tilt) if all(map(math.isfinite, (yaw, tilt, t.x, t.y))) else None
 
 

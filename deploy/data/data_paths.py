@@ -38,13 +38,18 @@ def model_path(robot: Robot, model_config: ModelConfig) -> Path:
     it gives the mode of which there is a model set, and direct if there are both or none.
 
     Raises:
-        BadModel: the note is damaged.
+        BadModel: the note is damaged, or the model set of the noted mode is gone, and there is one of the other mode.
     """
     if model_config.mode != AUTO:
         return data_root() / robot.name / f"{model_config.certificate}-{model_config.mode}.safetensors"
     paths = {mode: model_path(robot, replace(model_config, mode=mode)) for mode in (DIRECT, ONE_STEP)}
-    order = dict.fromkeys((_noted_mode(robot, model_config) or DIRECT, DIRECT, ONE_STEP))
-    return next((paths[mode] for mode in order if paths[mode].exists()), paths[DIRECT])
+    noted, existing = _noted_mode(robot, model_config), [mode for mode in paths if paths[mode].exists()]
+    if noted and existing and noted not in existing:
+        raise BadModel(
+            f"the model set in use, {paths[noted]}, is gone: certify again with --use. To use the one of mode "
+            f"{existing[0]} instead, delete {_note_path(robot, model_config)}"
+        )
+    return paths[noted or next(iter(existing), DIRECT)] if existing else paths[DIRECT]
 
 
 def note_mode(robot: Robot, model_config: ModelConfig) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.reservation import Reservation
@@ -129,8 +130,8 @@ class BackupPlan:
         return self._plan_tokens[0] if self._plan_tokens else b""
 
     def measured(self, state: Array) -> None:
-        """Store the measured state (n,) of a period before its request; ignore it if it is not finite or misshapen."""
-        if state.shape == self.seen.shape and np.isfinite(state).all():
+        """Store the measured state (n,) of a period before its request; ignore it if the filter would refuse it."""
+        if state.shape == self.seen.shape and (np.abs(state) <= FARTHEST).all():  # NaN fails too
             self.seen, self._compare = state.copy(), True  # the caller may overwrite its array
 
     def accept(

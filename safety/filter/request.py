@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from brakeline.errors import BadRequest
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import FARTHEST, Shapes
-from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array, Robot
-from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
+from brakeline.safety.filter.scan_pose import check_scan
 from brakeline.safety.filter.widening import PastWindow
 
 FLOAT = np.dtype(float)
@@ -242,10 +241,8 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         _check_arrays(robot, shapes)
         if len(shapes) and not _plausible(shapes):
             raise BadRequest("obstacles", IMPOSSIBLE)
-    if isinstance(request.scan, Scan) and (robot.position_dim != 2 or robot.heading is None):
-        raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
-    if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
-        raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
+    if request.scan is not None:
+        check_scan(robot, request.state, request.scan)
 
 
 def _check_arrays(robot: Robot, shapes: Shapes) -> None:

@@ -46,6 +46,13 @@ class WatchedFlight:
         self.client, self.timing = MavlinkDecoder(lambda _: None), FlightTiming()
         self.watch = FlightWatch(self.client, self.timing)
         self.now, self.delay, self.jump, self.answers = BEGIN, 0.005, 0.0, True  # delay: s, each way
+        self.north, self.speed = 0.0, 0.0  # m, m/s
+
+    def pause(self, seconds: float, setpoint: float) -> None:
+        """Receive nothing for some seconds, while the vehicle follows a setpoint [m/s]."""
+        for _ in range(round(seconds / STEP)):
+            self.now += STEP
+            self.watch.note(self.now, setpoint)
 
     def fly(self, seconds: float) -> str:
         """Receive telemetry for some seconds. Return why it is lost in the end."""
@@ -56,7 +63,7 @@ class WatchedFlight:
                 continue  # what was sent before has arrived, and what is sent since then is on its way
             attitude = mavlink.MAVLink_attitude_message(round(1e3 * theirs), *[0] * 6).pack(MAV)
             force = mavlink.MAVLink_highres_imu_message(0, 0, 0, -9.81, *[0] * 10, 0).pack(MAV)
-            self.client.feed(heartbeat() + position(theirs) + bytes(attitude) + bytes(force))
+            self.client.feed(heartbeat() + position(theirs, self.north, self.speed) + bytes(attitude) + bytes(force))
             if k % 25 == 0 and self.answers:
                 asked = round(1e9 * (self.now - 2.0 * self.delay))
                 self.watch.clock_requested(asked)
@@ -146,6 +153,32 @@ def test_an_interruption_ends_our_command_for_good(flight: WatchedFlight, frames
         flight.client.feed(frame)
     for _ in range(3):
         assert re.fullmatch(f"our command of the vehicle has ended: {why}", flight.fly(1.0))
+
+
+@pytest.mark.parametrize(
+    ("gap", "setpoint", "speed", "north", "jumps"),
+    [
+        (5.0, 0.0, 0.0, 3.0, True),  # the autopilot has begun anew, or its localisation was set
+        (60.0, 0.0, 0.0, -20.0, True),
+        (5.0, 0.0, 0.0, 0.9, False),  # a hover drifts
+        (5.0, 1.0, 0.0, 5.0, False),  # the committed plan flies on
+        (5.0, 0.0, 4.0, 8.0, False),  # it brakes late
+        (5.0, 1.0, 1.0, 9.0, True),
+    ],
+)
+def test_a_position_beyond_the_reach_of_a_gap_of_telemetry_is_in_another_frame(
+    flight: WatchedFlight, gap: float, setpoint: float, speed: float, north: float, jumps: bool
+) -> None:
+    """Before, the vehicle counted as accelerating by 10 m/s² during the whole gap: 60 m after 5 s were no jump."""
+    flight.speed = speed
+    flight.fly(STEP)
+    flight.pause(gap, setpoint)
+    flight.north, flight.speed = north, 0.0
+    why = (
+        r"our command of the vehicle has ended: its position jumped by \d+\.\d\d m in a gap of \d+\.\d\d s, farther .*"
+    )
+    for _ in range(3):
+        assert re.fullmatch(why if jumps else "", flight.fly(1.0))
 
 
 def test_flying_is_no_interruption() -> None:

@@ -105,8 +105,8 @@ class Broken:
 BEYOND_BOUNDS, ENDLESS, NOT_FINITE, FAILING = Broken((0, 0), 9.0), Broken((0, -1), 0.2), Broken(0), Broken(None)
 
 
-@pytest.mark.parametrize("broken", [BEYOND_BOUNDS, ENDLESS, NOT_FINITE, FAILING, None])
-def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: Broken | None) -> None:
+@pytest.mark.parametrize("broken", [BEYOND_BOUNDS, ENDLESS, NOT_FINITE, FAILING])
+def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: Broken) -> None:
     """As `BackupPlan.fallback`: the first row brakes; the second goes on, unless the filter failed as a whole."""
     plans, single = BackupPlanBatch(SAFETY, 2), InProcess(SAFETY)
     free = ObstacleArrays.of([Shapes.of([], 2)] * 2)
@@ -115,10 +115,7 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
     assert np.allclose(plans.decide(states, actions, free).inputs, actions)
     single.decide(states[0], actions[0], [], known_free=True)
     states[:, 0], states[:, 3] = 0.03, 0.19
-    if broken is None:
-        actions[0, 1] = np.nan
-    else:
-        plans.safety = broken  # type: ignore[assignment]
+    plans.safety = broken  # type: ignore[assignment]
     outcome = plans.decide(states, actions, free)
     single.backup_plan.measured(states[0])
     assert np.allclose(outcome.inputs[0], single.backup_plan.fallback())
@@ -128,6 +125,28 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
         assert [outcome.answers.row(row).kind for row in range(2)] == [FAILSAFE, ALLOWED]
     assert np.allclose(outcome.inputs[1], actions[1]) == (broken is not FAILING)
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
+
+
+@pytest.mark.parametrize("safety", [lambda: SAFETY, one_step], ids=["periods", "windows"])
+def test_a_proposal_that_is_not_finite_is_decided_and_scored_as_by_a_single_plan(safety: Any) -> None:
+    """The robot leaves its set in the very period of that proposal, so the score of the period widens its sets."""
+    plans, single = BackupPlanBatch(safety(), 2), InProcess(safety(), accept_bound=1.0)
+    free = ObstacleArrays.of([Shapes.of([], 2)] * 2)
+    status, states, N = np.array(["", single.method.version, UNVERIFIED]), np.zeros((2, 5)), single.robot.horizon
+    for period in range(3 * N):
+        actions = np.zeros((2, 2))
+        if period == 2 * N:
+            actions[0, 1], states[0, 3] = np.nan, 0.1
+        outcome = plans.decide(states, actions, free)
+        answer = single.decide(states[0], actions[0], known_free=True)
+        assert outcome.decided.all() and not outcome.failure and outcome.answers is not None
+        assert outcome.answers.row(0).kind == answer.kind == (FAILSAFE if period == 2 * N else ALLOWED)
+        assert np.allclose(outcome.inputs[0], answer.action)
+        assert status[plans._status[0]] == single.backup_plan.model
+        factors = plans.widening[0], plans.state_widening[0]
+        assert factors == pytest.approx(single.backup_plan.widening.factors)
+        states[0, 3] = 0.0
+    assert plans.state_widening[0] > 1.5 and plans.widening[1] == 1.0
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e300])

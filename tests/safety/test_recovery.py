@@ -111,8 +111,12 @@ def test_a_robot_that_may_be_too_close_by_less_than_the_measurement_errors_stand
 
 
 @pytest.mark.parametrize("ranges, least", [(np.nan, 0.0), (3.5, 3.5)], ids=["nothing seen", "all seen"])
-def test_no_way_out_is_known_where_a_scan_shows_nothing(ready, ranges, least):
-    """Odometry may jump, or a sensor may measure nothing: the robot must not drive off."""
+def test_no_way_out_is_known_where_a_scan_shows_nothing(ready, monkeypatch, ranges, least):
+    """Odometry may jump, or a sensor may measure nothing: the robot must not drive off.
+
+    A request refuses a pose so far away, but not that of a robot whose largest speed is not known.
+    """
+    monkeypatch.setattr("brakeline.safety.filter.scan_pose._largest_rate", lambda *_: math.inf)
     scan = Scan(np.full(len(FAN), ranges), FAN, pose=(0.0, 0.0, 0.0), age=0.2)
     for distance in (0.01, 0.3, 0.75, 1.25, 2.5, 3.0, 3.51, 5.0, 40.0):
         for i, angle in enumerate(np.radians(np.arange(0, 360, 40))):

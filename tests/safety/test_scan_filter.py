@@ -1,7 +1,7 @@
 """Decisions from scans alone: the filter keeps off all space that the scan does not show to be free."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -112,6 +112,35 @@ def test_a_measurement_that_is_malformed_or_of_another_dimension_is_refused(robo
         check_for_filter(robot, request_of(message, robot))
     assert error.value.field == field
     check_for_filter(QUADROTOR, request_of(asked(QUADROTOR, SPACE_IMAGE), QUADROTOR))  # in space, an image is sound
+
+
+BY_THRUST = replace(GROUND, action=("thrust [N]", "torque [N m]"))
+
+
+@pytest.mark.parametrize(
+    ("robot", "state", "sensed", "field"),
+    [
+        (GROUND, [0.4, 0.0, 0.9, 0.2, 0.0], GROUND_SCAN, ""),  # the robot's way in 2 s
+        (GROUND, [3.0, 0.0, 0.0, 0.0, 0.0], GROUND_SCAN, "scan"),
+        (GROUND, [3.0, 0.0, 0.0, 1.6, 0.0], GROUND_SCAN, ""),  # it is faster than its inputs allow, as downhill
+        (GROUND, [3.0, 0.0, 0.0, 0.0, 0.0], replace(GROUND_SCAN, position_error=2.6), ""),
+        (GROUND, [3.0, 0.0, 0.0, 0.0, 0.0], replace(GROUND_SCAN, age=2.1), ""),  # so old that it shows no free space
+        (GROUND, [0.0, 0.0, 1.57, 0.0, 0.0], GROUND_SCAN, "scan"),
+        (GROUND, [0.0, 0.0, 6.28, 0.0, 0.0], GROUND_SCAN, ""),
+        (BY_THRUST, [3.0, 0.0, 1.57, 0.0, 0.0], GROUND_SCAN, ""),  # its largest speed is not known
+        (QUADROTOR, [10.0] + [0.0] * 8, SPACE_IMAGE, ""),
+        (QUADROTOR, [30.0] + [0.0] * 8, SPACE_IMAGE, "image"),
+    ],
+)
+def test_a_measurement_from_a_pose_that_the_robot_cannot_have_come_from_is_refused(robot, state, sensed, field):
+    """As with a state in another frame: the measurement would show space elsewhere as free."""
+    message = request_message(BackupPlan(robot), state, np.zeros(robot.action_dim), scan=sensed)
+    if not field:
+        check_for_filter(robot, request_of(message, robot))
+        return
+    with pytest.raises(BadRequest, match=r"its pose is .* from the state, .*: give both in one frame") as error:
+        check_for_filter(robot, request_of(message, robot))
+    assert error.value.field == field
 
 
 @pytest.mark.parametrize(

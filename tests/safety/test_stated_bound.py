@@ -136,8 +136,9 @@ def test_a_wrapper_with_a_client_keeps_the_limit_that_it_was_given(model):
         SafetyWrapper(Nothing(), client, actions=free, accept_bound=0.01)
     served = SafetyWrapper(Nothing(), ServiceClient(loose), actions=free, accept_bound=0.01)
     served.reset()
-    with pytest.raises(TooLoose, match=r"at most 27 % .* accept_bound is 1 %"):
-        served.step(np.zeros(2))
+    for _ in range(2):  # a second step names no other environment
+        with pytest.raises(TooLoose, match=r"at most 27 % .* accept_bound is 1 %"):
+            served.step(np.zeros(2))
     for bad in (-1.0, 0.0, 7.0, math.nan):
         for one in (client, ServiceClient(loose)):
             with pytest.raises(ValueError, match="share above 0"):

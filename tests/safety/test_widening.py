@@ -235,6 +235,23 @@ def test_a_model_set_that_scores_no_windows_is_widened_by_what_each_period_uses(
     assert widening[-1] == widening[-2], "an episode has begun: nothing was predicted"
 
 
+@pytest.mark.parametrize("safety", [ready, lambda: Filter.load("ground")], ids=["windows", "periods"])
+@pytest.mark.parametrize("far", [2e4, np.nan])
+def test_a_state_that_the_filter_refuses_has_no_score(safety, far):
+    client, state = InProcess(safety(), accept_bound=1.0), np.zeros(5)
+    for period in range(3 * N):
+        state[1] = far if period == N + 1 else 0.0
+        if period == N + 1:
+            with pytest.raises(BadRequest):
+                client.decide(state, np.zeros(2), known_free=True)
+            client.fallback()
+        else:
+            client.decide(state, np.zeros(2), known_free=True)
+        past = client.backup_plan.past
+        assert past is None or (np.abs(past.states) <= 1.0).all()
+    assert client.backup_plan.widening.factors == (1.0, 1.0)
+
+
 @pytest.mark.parametrize("state", [[1.0, 0.0], [np.nan, 0.0]])
 def test_a_set_without_width_or_a_number_is_used_up(state):
     center = np.pad(np.array(state), (0, 3))

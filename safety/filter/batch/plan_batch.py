@@ -33,7 +33,7 @@ Observations = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 SAME_INPUT = 1e-9  # rounding allowed in a plan at the bounds of its inputs
-NO_DECISION = "a state, observation or proposal that is not finite or too large, or a plan that is not possible"
+NO_DECISION = "a state or observation that is not finite or too large, or a plan that is not possible"
 STANDING, VERIFIED, OPEN = range(3)  # of a committed plan: it stands, the model set verified it, nothing did
 
 
@@ -134,19 +134,19 @@ class BackupPlanBatch:
     ) -> BatchOutcome:
         """Decide on proposals (B, m), and commit to the plans of the decisions.
 
-        Arrays in single precision are converted.
+        The decision on a proposal that is not finite is a failsafe. Arrays in single precision are converted.
 
         observations (B, o): by which a rival decides; the filter does not need them.
         """
         states, actions, obstacles = np.asarray(states, float), np.asarray(actions, float), mapped(obstacles, _precise)
-        usable = _plausible(states) & np.isfinite(actions).all(axis=1)
+        usable = _plausible(states)
         if observations is not None:
             usable &= np.isfinite(observations).all(axis=1)
             observations = np.where(usable[:, None], observations, np.float32(0.0))
         # One row that is not valid would cost all others their decisions: it gets valid values, and no decision.
-        measured, proposals = np.where(usable[:, None], states, 0.0), np.where(usable[:, None], actions, 0.0)
+        measured = np.where(usable[:, None], states, 0.0)
         try:
-            answers = self.safety.decide_batch(self.request(measured, proposals, obstacles, observations))
+            answers = self.safety.decide_batch(self.request(measured, actions, obstacles, observations))
         except (BadRequest, ArithmeticError, np.linalg.LinAlgError) as error:
             log.exception("no decisions, so all robots brake along their committed plans")
             failure = f"{type(error).__name__}: {error}"

@@ -266,6 +266,17 @@ def test_after_a_jump_of_the_pose_the_plan_from_before_does_not_count_as_verifie
         assert gate.kind == "allowed"
 
 
+def test_a_robot_that_stood_is_not_elsewhere_after_a_gap_of_the_odometry():
+    with stepped(sensors=SensorSettings(mount=PlanarPose())) as (node, clock, period, _):
+        due, reasons = 100.2, []
+        for x in (0.0, 0.0, 0.0, None, None, 0.2, 0.2):
+            for i in range(1, 12) if x is not None else ():
+                node.inputs.on_odometry(odometry(clock.time + 0.02 * i, x, 0.0))
+            due = period(due)
+            reasons.append(node.gate.reason)
+        assert "the pose jumped by 0.20 m" in reasons[6], reasons
+
+
 def test_an_answer_for_a_past_period_does_not_count():
     with stepped() as (node, clock, period, _):
         gate = node.gate

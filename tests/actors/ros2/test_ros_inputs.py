@@ -1,6 +1,7 @@
 """The inputs of a decision, from scans, odometry and transforms, and the reasons for which they are missing."""
 
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -205,6 +206,52 @@ def test_a_robot_brakes_in_a_gap_so_a_pose_that_is_far_away_after_it_is_a_jump(g
     inputs.on_odometry(odometry(10.0 + gap, x, 0.0, heading))
     with pytest.raises(PoseJumped, match=rf"the pose jumped by .* within {gap:.2f} s"):
         inputs.state(10.0 + gap, 10.0 + gap)
+
+
+@pytest.mark.parametrize("gap", [0.5, 60.0])
+@pytest.mark.parametrize(("stood", "x", "heading", "jumps"), [
+    (True, 0.1, 0.0, True), (True, 0.05, 0.05, False), (True, 0.0, 0.1, True),
+    (False, 0.5, 0.0, True), (False, 0.2, 0.3, False),
+])  # fmt: skip
+def test_in_a_gap_a_robot_moves_no_farther_than_its_inputs(gap, stood, x, heading, jumps):
+    """Before, a robot that stood could find itself 63 cm away after its odometry had begun anew."""
+    inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose()), AgeLimits())
+    speed = np.array([0.0, 0.0] if stood else [0.25, 0.5])
+    inputs.executed(speed, 8.0)
+    for i in range(3):
+        inputs.on_odometry(odometry(9.9 + 0.05 * i))
+    inputs.executed(0.5 * speed, 10.3)
+    inputs.executed(np.zeros(2), 10.45)
+    inputs.on_odometry(odometry(10.0 + gap, x, 0.0, heading))
+    inputs.on_odometry(odometry(10.05 + gap, x, 0.0, heading))
+    with pytest.raises(PoseJumped, match="can't have done") if jumps else nullcontext():
+        inputs.state(10.05 + gap, 10.05 + gap)
+
+
+@pytest.mark.parametrize("transforms", [False, True])
+def test_odometry_of_a_robot_that_leans_does_not_count_until_it_stands_upright(transforms):
+    """As on its side, or from a driver that counts its angles otherwise."""
+    settings = SensorSettings(mount=PlanarPose(), base_frame="base_footprint" if transforms else "")
+    inputs = RosInputs(ROBOT, settings, AgeLimits())
+
+    def measure(at, lean):
+        turn = cdr.Quaternion(x=math.sin(0.5 * lean), y=0.0, z=0.0, w=math.cos(0.5 * lean))
+        message = odometry(at)
+        message.pose.pose.orientation = turn
+        moved = cdr.TFMessage(transforms=[transform("odom", "base_footprint", rotation=turn, at=at)])
+        inputs.on_transforms(moved) if transforms else inputs.on_odometry(message)
+
+    for k in range(8):
+        measure(9.8 + 0.02 * k, 0.3)
+    assert inputs.state(9.93, 9.95) is not None, "a ramp"
+    for lean in (0.35, 1.57, -math.pi):
+        measure(9.96, lean)
+        with pytest.raises(
+            InputMissing, match=rf"leans by {abs(math.degrees(lean)):.0f}° against 'odom': .* at most 18°"
+        ):
+            inputs.state(9.95, 9.97)
+    measure(9.96, 0.0)
+    assert inputs.state(9.95, 9.97) is not None
 
 
 def test_odometry_in_another_frame_is_refused_and_both_are_named():

@@ -109,6 +109,16 @@ def paths(tmp_path, monkeypatch):
     return made
 
 
+@pytest.mark.parametrize(("deleted", "stays"), [(ONE_STEP, DIRECT), (DIRECT, ONE_STEP)])
+def test_a_model_set_in_use_that_is_gone_is_not_replaced_by_an_older_one(paths, deleted, stays):
+    use(stays, 1.0), use(deleted, 1.1)
+    paths[deleted].unlink()
+    with pytest.raises(BadModel, match=rf"{paths[deleted]}, is gone: .* mode {stays} instead, delete .*\.in_use"):
+        model_path(GROUND, ModelConfig(mode=AUTO))
+    paths[stays].unlink()
+    assert model_path(GROUND, ModelConfig(mode=AUTO)) == paths[DIRECT], "as if none had ever been there"
+
+
 def test_a_touched_file_is_not_the_newest(paths):
     assert model_path(GROUND, ModelConfig(mode=AUTO)) == paths[DIRECT], "there is none"
     paths[ONE_STEP].write_bytes(b"")
