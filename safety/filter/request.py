@@ -108,12 +108,14 @@ class Request(ComparedByValue):
         """Whether the proposed action is finite. If not, every method brakes."""
         return all(map(math.isfinite, self.action.ravel().tolist()))
 
+    def names_standing(self, robot: Robot) -> bool:
+        """Return whether the input in force and the plan are those of a robot that stands, whatever its speeds."""
+        rests = not self.model and bool(robot.is_stop_input(self.plan).all())
+        return rests and robot.may_be_standing(self.input_in_force)
+
     def still(self, robot: Robot) -> bool:
         """Return whether the robot stands and its plan is to stand. No model set needs to verify that."""
-        committed = (
-            not self.model and bool(robot.is_stop_input(self.plan).all()) and robot.may_be_standing(self.input_in_force)
-        )
-        return committed and robot.is_standing(self.state)
+        return self.names_standing(robot) and robot.is_standing(self.state)
 
     @property
     def touches_another(self) -> bool:
