@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -117,11 +118,15 @@ class Request(ComparedByValue):
         """Return whether the robot stands and its plan is to stand. No model set needs to verify that."""
         return self.names_standing(robot) and robot.is_standing(self.state)
 
-    @property
-    def touches_another(self) -> bool:
-        """Whether the robot's reservation touches another robot's."""
-        own, others = self.reservation, self.other_reservations
-        return own is not None and others is not None and others.touch(own)
+    def reservation_faults(self, robot: Robot) -> Iterator[str]:
+        """Yield why the robot's reservation does not keep the other robots away from it, or it from them."""
+        own, others, d = self.reservation, self.other_reservations, robot.position_dim
+        if own is None:
+            return
+        if others is not None and others.touch(own):
+            yield "the robot's reservation touches another robot's"
+        if not own.may_contain(self.state[:d], robot.measurement_bound[:d], robot.footprint):
+            yield "the robot has left the space that it reserves"
 
 
 @dataclass(frozen=True, eq=False)
