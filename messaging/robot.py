@@ -301,8 +301,12 @@ class Robot:
         return np.asarray(np.clip(wanted, low, high))
 
     def is_standing(self, state: Array) -> bool:
-        """Return whether all measured speeds in a state (n,) are at most `stopped`."""
-        return bool((np.abs(state[list(self.regressor)]) <= self.stopped).all())
+        """Return whether all measured speeds in a state (n,) are at most `stopped`.
+
+        In joint space, angles are regressors, too: there, the speeds are the coordinates that follow an input, if any.
+        """
+        speeds = list(self.regressor) if self.position_dim else self.speed_indices or list(self.regressor)
+        return bool((np.abs(state[speeds]) <= self.stopped).all())
 
     def is_stopping(self, inputs: Array, state: Array, before: Array) -> bool:
         """Return whether the inputs (m,) keep a robot standing, in the measured state (n,) after the input `before`."""

@@ -110,6 +110,8 @@ class BackupPlan:
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self.widening.interrupt()
         self._judged = False
+        # boxes of the next positions, from the last decision's tube: centers and half-widths (k, d)
+        self._tube: tuple[Array, Array] | None = None
         self._compare = False  # a state was measured since the last decision
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._plan_tokens: tuple[bytes, ...] = ()  # for this period and the later ones; the last one stays
@@ -133,6 +135,8 @@ class BackupPlan:
         """Store the measured state (n,) of a period before its request; ignore it if the filter would refuse it."""
         if state.shape == self.seen.shape and (np.abs(state) <= FARTHEST).all():  # NaN fails too
             self.seen, self._compare = state.copy(), True  # the caller may overwrite its array
+            if self.predicted is None and self.model and not self.still_verified:
+                self.model, self._plan_tokens = UNVERIFIED, ()
 
     def accept(
         self,
@@ -146,6 +150,7 @@ class BackupPlan:
         judges: bool = False,
         outside_share: float = 0.0,
         plan_score: float | None = None,
+        tube: tuple[Array, Array] | None = None,
     ) -> Array:
         """Commit to the plan of a decision; return the input to execute next.
 
@@ -155,6 +160,8 @@ class BackupPlan:
             judges: whether the filter can score a window. If not, `past` gives none, and the last period is scored.
             outside_share: the share of windows that may leave the sets.
             plan_score: that of the decision; None: `score` stands for it, too.
+            tube: centers and half-widths (N, d) of the decision's tube. After a period without a decision there is no
+                predicted set, so the next positions are compared with the tube.
         """
         self._judged = judges
         if score is None and not judges and self._compare and self.predicted is not None:  # the model set before did
@@ -166,13 +173,21 @@ class BackupPlan:
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
         self.predicted = predicted.copy() if predicted is not None and len(predicted.center) else None
-        return self._advance()
+        action = self._advance()
+        self._tube = None if tube is None else (tube[0].copy(), tube[1].copy())
+        return action
 
     @property
     def still_verified(self) -> bool:
-        """Whether the plan is verified and the measured state is in its predicted set."""
-        outside = self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen)
-        return self.model != UNVERIFIED and not outside
+        """Whether the plan is verified and the measured state is in its predicted set; without one, in its tube."""
+        if self.model == UNVERIFIED or not self._compare:
+            return self.model != UNVERIFIED
+        if self.predicted is not None:
+            return self.predicted.contains(self.robot, self.seen)
+        if self._tube is None or not self._tube[0].size:  # none is left: the plan has ended
+            return True
+        center, half_width = (part[0] for part in self._tube)
+        return bool((np.abs(self.seen[: len(center)] - center) <= half_width + SAME_SET).all())
 
     def executes(self, action: Array) -> None:
         """Take in the input (m,) that a robot in real time executes. If the plan has another, it is not verified."""
@@ -182,7 +197,7 @@ class BackupPlan:
 
     def distrust(self) -> None:
         """Stop counting the plan as verified, since the robot left it: the robot brakes along it all the same."""
-        self.model, self.predicted, self.reservation = UNVERIFIED, None, None
+        self.model, self.predicted, self.reservation, self._tube = UNVERIFIED, None, None, None
         self._plan_tokens, self._compare = (), False
         self.widening.interrupt()
 
@@ -213,6 +228,7 @@ class BackupPlan:
             self.widening.interrupt()
         self._compare = False
         self._plan_tokens = self._plan_tokens[1:] or self._plan_tokens
+        self._tube = None if self._tube is None else (self._tube[0][1:], self._tube[1][1:])
         self.reservation = None if self.reservation is None else self.reservation.later()
         rests = not blind and robot.is_stopping(now, self.seen, self.input_in_force)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[-1])

@@ -291,8 +291,8 @@ class Filter:
         """Return the committed backup plan, or a plan that is verified anew, or one that is not verified.
 
         The committed plan still counts as verified if the measured state is in the predicted set, this model set
-        verified the plan or the robot stands, no obstacle broke its bounds (docs/method.md §4), and the robot's
-        reservation touches no other (§9). Otherwise, the
+        verified the plan or the robot stands, no obstacle broke its bounds (docs/method.md §4), and the robot is in its
+        reservation, which touches no other (§9). Otherwise, the
         filter verifies the rest of that plan and then the strongest braking from the new measurement, each followed by
         the robot's stop rule. If neither is verified, the one with the larger margin is executed: a plan that evades an
         obstacle may need no more than some millimetres, while braking leads straight into it. Outside the recorded
@@ -304,8 +304,8 @@ class Filter:
         tail, constraints, as_committed = self._rest_of_plan(request, local_map, z_0)
         was_verified = request.model == self.version and not record.broken
         was_verified |= stands(request, local_map, constraints, as_committed, self.start)
-        if request.touches_another:
-            record.reason += "; the robot's reservation touches another robot's"
+        for fault in request.reservation_faults(self.robot):
+            record.reason += f"; {fault}"
             was_verified = False
         if record.contained and was_verified:
             margin = constraints.margin_in(local_map, as_committed)

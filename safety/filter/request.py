@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -108,18 +109,24 @@ class Request(ComparedByValue):
         """Whether the proposed action is finite. If not, every method brakes."""
         return all(map(math.isfinite, self.action.ravel().tolist()))
 
+    def names_standing(self, robot: Robot) -> bool:
+        """Return whether the input in force and the plan are those of a robot that stands, whatever its speeds."""
+        rests = not self.model and bool(robot.is_stop_input(self.plan).all())
+        return rests and robot.may_be_standing(self.input_in_force)
+
     def still(self, robot: Robot) -> bool:
         """Return whether the robot stands and its plan is to stand. No model set needs to verify that."""
-        committed = (
-            not self.model and bool(robot.is_stop_input(self.plan).all()) and robot.may_be_standing(self.input_in_force)
-        )
-        return committed and robot.is_standing(self.state)
+        return self.names_standing(robot) and robot.is_standing(self.state)
 
-    @property
-    def touches_another(self) -> bool:
-        """Whether the robot's reservation touches another robot's."""
-        own, others = self.reservation, self.other_reservations
-        return own is not None and others is not None and others.touch(own)
+    def reservation_faults(self, robot: Robot) -> Iterator[str]:
+        """Yield why the robot's reservation does not keep the other robots away from it, or it from them."""
+        own, others, d = self.reservation, self.other_reservations, robot.position_dim
+        if own is None:
+            return
+        if others is not None and others.touch(own):
+            yield "the robot's reservation touches another robot's"
+        if not own.may_contain(self.state[:d], robot.measurement_bound[:d], robot.footprint):
+            yield "the robot has left the space that it reserves"
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brakeline.messaging.obstacle import Array, Shapes
 from brakeline.messaging.value_equality import ComparedByValue
@@ -47,6 +47,14 @@ class Reservation(ComparedByValue):
         low, high = center - half_width, center + half_width
         low, high = np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
         return Reservation(0.5 * (low + high), 0.5 * (high - low), radius)
+
+    def may_contain(self, position: Array, error: ArrayLike, body: float) -> bool:
+        """Return whether a robot with a measured position (d,) may be in the box of the present period.
+
+        error (d,): largest errors of the position [m]. body: radius of the robot [m], which `radius` contains.
+        """
+        beyond = np.maximum(np.abs(position - self.center[0]) - self.half_width[0] - error, 0.0)
+        return bool(np.linalg.norm(beyond) <= self.radius[0] - body + ROUNDED)
 
     def later(self) -> Reservation:
         parts = self.center, self.half_width, self.radius

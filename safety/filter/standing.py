@@ -53,7 +53,7 @@ def may_drive_already(request: Request, robot: Robot) -> bool:
     Such a request names the input in force of a standing robot, and nobody knows the true one. A robot whose measured
     speeds are no more than their errors counts as standing. Whether another one drives, `stands` says.
     """
-    if request.predicted is not None or not request.still(robot):
+    if request.predicted is not None or not request.names_standing(robot):
         return False
     speeds = list(robot.regressor)
     return bool((np.abs(request.state[speeds]) > np.asarray(robot.measurement_bound)[speeds]).any())

@@ -186,4 +186,5 @@ def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
         answer.judges,
         answer.outside_share,
         answer.plan_score,
+        (answer.tube_center, answer.tube_half_width),
     )

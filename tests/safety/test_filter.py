@@ -63,6 +63,23 @@ def test_nothing_is_verified_before_the_input_in_force_of_a_robot_that_flies_is_
         assert client.decide(flies, first[0].action, known_free=True).kind == kind
 
 
+@pytest.mark.parametrize(
+    ("name", "stopped", "speed"), [("quadrotor", 0.5, 0.6), ("quadrotor", 0.5, 4.9), ("ground", 0.06, 0.25)]
+)
+def test_a_robot_whose_description_says_when_it_stands_drives_already_above_that_speed(name, stopped, speed):
+    """Its first request names the input of a robot that stands. Each proposal was allowed, and verified."""
+    model = ModelSet.load(name)
+    ready = Filter(replace(model, robot=replace(model.robot, stopped=stopped)))
+    moves, nothing = np.zeros(len(model.robot.state)), np.zeros(len(model.robot.action))
+    moves[3] = speed  # m/s
+    client = InProcess(ready)
+    answers = [client.decide(moves, nothing, known_free=True) for _ in range(2)]
+    assert [(one.kind, one.verified) for one in answers] == [(FAILSAFE, False), (ALLOWED, True)]
+    assert answers[0].reason == DRIVES_ALREADY
+    rests = InProcess(ready).decide(moves * stopped / speed, nothing, known_free=True)
+    assert (rests.kind, rests.verified) == (ALLOWED, True)
+
+
 @pytest.mark.parametrize("speed", [0.0, 0.1, 0.2])  # m/s
 def test_a_robot_that_rolls_does_not_stand_because_its_sets_were_widened(speed):
     """It rolled 0.8 m and hit the wall, and all the way its plan to stand was verified, in sets 150 times as wide."""

@@ -80,3 +80,35 @@ def test_a_robot_whose_reservation_touches_nothing_keeps_it_although_its_sets_ar
         answers = fleet.decide(states, [[0.25, 0.0]] * 2, known_free=True)
         assert all(answer.verified for answer in answers)
         assert not step or answers[0].kind == FAILSAFE
+
+
+def test_a_robot_that_was_carried_away_while_no_answers_came_keeps_no_reservation_elsewhere(model: ModelSet) -> None:
+    """The others were verified against its old one: a robot drove through it, and all decisions were verified."""
+    fleet = fleet_of(model, 2)
+    states = np.array([[0.0, 0.0, 0.0, 0.0, 0.0], [2.0, 0.0, np.pi, 0.0, 0.0]])
+    fleet.decide(states, np.zeros((2, 2)), known_free=True)
+    fleet.fallback()
+    states[1, 0] = 0.26  # m
+    for period in range(20):
+        answers = fleet.decide(states, np.tile([0.25, 0.0], (2, 1)), known_free=True)
+        for answer, state, way in zip(answers, states, (1.0, -1.0), strict=True):
+            assert answer.reservation is not None
+            assert answer.reservation.may_contain(state[:2], GROUND.measurement_bound[:2], GROUND.footprint)
+            state[0] += way * GROUND.period * answer.action[0]
+        assert period or (not answers[1].verified and "has left the space" in answers[1].reason)
+        assert states[1, 0] - states[0, 0] > 2.0 * GROUND.footprint
+
+
+def test_a_robot_that_slides_out_of_its_reservation_is_verified_no_more(model: ModelSet) -> None:
+    """It slides within its predicted sets. Another one drove into its place, and all decisions were verified."""
+    fleet, verified = fleet_of(model, 2), []
+    states = np.array([[0.0, 0.0, 0.0, 0.0, 0.0], [0.4, 0.0, np.pi, 0.0, 0.0]])
+    for step in range(20):
+        blind = [[0.25 * (step > 0), 0.0], [np.nan if step else 0.0, 0.0]]
+        answers = fleet.decide(states, blind, known_free=True)
+        verified.append(answers[1].verified)
+        states[0, [0, 3]] = states[0, 0] + GROUND.period * answers[0].action[0], answers[0].action[0]
+        states[1, 0] -= 0.002  # m
+        if states[1, 0] - states[0, 0] < 2.0 * GROUND.footprint:
+            break
+    assert verified[0] and not verified[-1]

@@ -229,6 +229,14 @@ def test_an_arm_that_moves_when_its_program_begins_has_no_verified_plan_to_stand
         assert (decision.kind, decision.verified) == (FAILSAFE, True)
 
 
+def test_an_arm_whose_description_says_when_it_stands_drives_already_above_that_speed_at_any_angle():
+    model = certified()[0]
+    filter = Filter(replace(model, robot=replace(model.robot, stopped=0.05)))
+    for speed, first in ((0.02, (ALLOWED, True)), (0.1, (FAILSAFE, False))):
+        decision = InProcess(filter, accept_bound=1.0).decide([0.5, -0.5, speed, 0.0], [0.3, 0.0])
+        assert (decision.kind, decision.verified) == first
+
+
 def test_an_arm_that_stands_beyond_a_limit_recovers():
     arm, client, kinds = Joints(joints(2), np.random.default_rng(6)), safety(), []
     arm.reset(np.array([1.1, 0.0]))

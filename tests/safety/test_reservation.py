@@ -37,6 +37,14 @@ def test_each_period_removes_the_first_box_and_keeps_the_last():
     assert (later.center == reservation.center[-1]).all() and (later.half_width == reservation.half_width[-1]).all()
 
 
+def test_a_measured_position_may_be_outside_of_the_box_by_its_error_and_the_last_millimetres():
+    box = Reservation(np.zeros((N, 2)), np.tile([0.1, 0.2], (N, 1)), np.full(N, 0.105 + 0.003))
+    places = ((0.11, 0.0), True), ((0.112, 0.21), True), ((0.114, 0.0), False), ((0.113, 0.213), False)
+    for position, inside in places:
+        assert box.may_contain(np.array(position), (0.01, 0.01), 0.105) == inside
+        assert box.may_contain(-np.array(position), (0.01, 0.01), 0.105) == inside
+
+
 @settings(max_examples=200)
 @given(st.integers(0, 10**6))
 def test_points_in_a_periods_half_space_keep_off_the_reservation_of_that_period(seed):
