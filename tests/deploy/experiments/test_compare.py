@@ -382,6 +382,18 @@ def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():
     assert steps_to_learn({name: [*values, *later[name]] for name, values in batch.items()}, 5000) == 4038
 
 
+def test_a_training_without_a_whole_episode_has_dashes_and_its_evaluations_stay(cells, tmp_path):
+    whole = cells[METHODS[-1], SINGLE]
+    training = whole["training"] | {"episodes": {name: [] for name in whole["training"]["episodes"]}}
+    rows = table([whole | {"training": training}])
+    figures, text = next(iter(rows["parts"]["training"].values())), markdown(rows)
+    assert figures["collision rate"] is None is figures["interventions"] and figures["collisions"] == 0.0
+    assert "| collision rate | – |" in text and "no episode ended" in text and "| goal rate |" in text
+    assert "no episode ended" not in markdown(table([whole]))
+    learning_curves([whole | {"training": training}], tmp_path / "curves.png")
+    seeds_as_points(rows, tmp_path / "seeds.png")
+
+
 def test_the_goals_of_training_are_counted_in_thirds_of_the_steps():
     def trained(goals, ends):
         return {"steps": 300, "episodes": {"goal": goals, "steps": ends, "begin": [0] * len(ends), "end": ends}}
