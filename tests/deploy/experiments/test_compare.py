@@ -1,6 +1,7 @@
 """The comparison: cells, figures by hand, and the same seed twice."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -211,6 +212,13 @@ def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
     assert "**" not in markdown(table(changed(method="lagrange"))), "the paper has no figure of TD3-Lagrange"
     with pytest.raises(ValueError, match="one robot"):
         table(changed(robot="quadrotor"))
+
+
+def test_the_help_of_the_methods_names_each_of_them(capsys):
+    with pytest.raises(SystemExit):
+        parse("compare", ["--help"])
+    words = set(re.findall(r"[\w-]+", capsys.readouterr().out))
+    assert set(compared_methods.METHODS) <= words
 
 
 def test_the_studies_of_a_comparison():
