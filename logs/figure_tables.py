@@ -165,7 +165,7 @@ def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
     yield "closest approach", known("{:.3f} m, to fixed obstacles", figures.get("closest_approach"))
     containment = figures["containment"]
     outside = share(containment["violations"], containment["steps"], intervals.get("violations"), digits=3)
-    yield "outside the predicted set", outside
+    yield "outside the predicted set", outside if containment["steps"] else "no step has a predicted set"
     if figures["recovering"]:
         yield "recovering", share(figures["recovering"], steps)
     if figures["broken"]:

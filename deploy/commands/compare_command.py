@@ -65,8 +65,9 @@ class CompareCommand:
     """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas. A robot of
     your own without an arena of the name dense is evaluated in default alone."""
     methods: tuple[str, ...] | None = None
-    """Compare these methods. Defaults to all that the robot and the arenas allow. FILE.py:CLASS is a filter of your own
-    (see docs/rivals.md). Give another --results folder with it."""
+    """Compare these methods: ddpc (this project's own), sailr, secas, none (TD3 without a filter), lagrange, cbf, psf,
+    sac, sac-ddpc, or FILE.py:CLASS for a filter of your own, which needs another --results folder (see docs/rivals.md).
+    Defaults to all that the robot and the arenas allow."""
     backend: Literal["single", "batch"] | None = None
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""

@@ -75,7 +75,8 @@ class ImportCommand:
         )
         counts = f"{imported.data.periods} periods in {imported.report.trajectories} trajectories"
         missing = [Text.from_markup(f"[yellow]missing:[/] {escape(text)}") for text in covered.missing]
-        next_command = shlex.join(["brakeline", "certify", self.robot, "--data", str(path), "--use"])
+        data = [] if self.out is None else ["--data", str(path)]
+        next_command = shlex.join(["brakeline", "certify", self.robot, *data, "--use"])
         following = [] if covered.refused else [f"{path}: {counts}", f"next: {next_command}"]
         print_result(self.json, figures, *imported.report.notes, coverage_table(covered), lengths, *missing, *following)
         if covered.refused and not self.json:

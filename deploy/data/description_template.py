@@ -66,7 +66,7 @@ def _input(one: InferredColumn) -> str:
     values |= {"low": min(_outwards(one.least), 0.0), "high": max(_outwards(one.most), 0.0)}
     values |= {} if most is None else {"slew": most}
     values |= {"moves": not one.steers if one.moves is None else one.moves, "stop": "hold" if one.steers else "ramp"}
-    remarks = [] if one.unit else [f"its unit {UNKNOWN}"]
+    remarks = [] if one.unit else [f'its unit {UNKNOWN}; a steering angle has unit = "rad" and stop = "hold"']
     remarks += [] if one.moves is not None else [f"moves: {UNKNOWN}, the log never changes it alone"]
     remarks += ["it jumps, so that it has no slew limit"] if most is None else []
     return _line(one.name, values, remarks)

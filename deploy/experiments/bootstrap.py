@@ -52,7 +52,7 @@ def ratio(
     """
     pairs = [(np.asarray(a, float), np.asarray(b, float)) for a, b in zip(above, below, strict=True)]
     if not pairs or not all(len(a) for a, _ in pairs):
-        raise ValueError("an interval needs at least one episode of each seed: train for more steps")
+        raise ValueError("an interval needs at least one episode of each seed")
     rng = np.random.default_rng(seed)
     per_seed = np.array([a.sum() / b.sum() for a, b in pairs])
     if crossed and len({len(a) for a, _ in pairs}) > 1:

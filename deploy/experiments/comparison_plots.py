@@ -51,6 +51,9 @@ def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
     for result in results:
         episodes = result["training"]["episodes"]
         ends, values = spans(episodes)[1], np.array(episodes[name], float)
+        if not len(ends):  # the training ended within its first episodes
+            lines.append(np.full_like(grid, 0.0 if name == "collision" else np.nan))
+            continue
         if name == "collision":
             order = np.argsort(ends, kind="stable")
             lines.append(np.interp(grid, ends[order], np.cumsum(values[order]), left=0.0))
@@ -118,7 +121,8 @@ def seeds_as_points(table: dict[str, Any], png: Path) -> None:
                 axes.set_axis_off()
                 continue
             for place, (method, estimate) in enumerate(methods.items()):
-                _draw_estimate(axes, place, estimate, colors[method])
+                if estimate is not None:
+                    _draw_estimate(axes, place, estimate, colors[method])
             axes.set_xticks(range(len(methods)), [compared(m).label for m in methods])
             axes.set_title(f"{part}: {name} [%]", fontsize=10)
             axes.grid(axis="y", alpha=0.3)

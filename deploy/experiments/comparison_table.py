@@ -101,17 +101,18 @@ def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
 
 
 def training_rows(results: Sequence[Result]) -> Row:
-    """Return the figures of training over the seeds."""
+    """Return the figures of training over the seeds. A rate is None if no episode of a training ended."""
     trainings, model = [result["training"] for result in results], results[0]["model"]
     values, steps = _by_column(trainings), [training["steps"] for training in trainings]
     learned = [steps_to_learn(training["episodes"], training["steps"]) for training in trainings]
+    ended = all(map(len, values["collision"]))
     return {
-        "collision rate": rate(values["collision"]),
+        "collision rate": rate(values["collision"]) if ended else None,
         "collisions": float(np.mean([sum(counts) for counts in values["collision"]])),
         "steps to 90 % goals": mean([[value] for value in learned]),
         "seeds that got there": sum(value < limit for value, limit in zip(learned, steps, strict=True)),
-        "interventions": _interventions(values, compared(results[0]["study"]["method"]).filter),
-        CUT: rate([was_cut(training["episodes"]) for training in trainings]),
+        "interventions": _interventions(values, compared(results[0]["study"]["method"]).filter) if ended else None,
+        CUT: rate([was_cut(training["episodes"]) for training in trainings]) if ended else None,
         "pre-training samples": 0 if model is None else int(model["samples"]),
         "pre-training collisions": 0 if model is None else int(model["collisions"]),
         **_goals_by_third(trainings),
@@ -280,6 +281,8 @@ def markdown(figures: dict[str, Any], quick: bool = False) -> str:
         "intervention cut (SAILR) do not count for the steps to 90 % and for the goals of a third.",
         "",
     ]
+    if any(None in row.values() for row in figures["parts"]["training"].values()):
+        lines += ["–: in the training of some seed, no episode ended (in this third). Train for more steps.", ""]
     if note := version_note(figures["versions"]):
         lines += [f"**{note}.**", ""]
     for part, methods in figures["parts"].items():

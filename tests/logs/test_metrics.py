@@ -97,7 +97,9 @@ def test_without_steps_and_without_a_filter_there_are_no_numbers() -> None:
     tally = EpisodeStats()
     tally.step(pb.Step(speed=0.1))
     assert closed_loop([tally])["decision_ms"] is None
-    assert "steps" in printed(show(Metrics().figures())), "an empty run can be shown"
+    empty = printed(show(Metrics().figures()))
+    assert "steps" in empty, "an empty run can be shown"
+    assert "no step has a predicted set" in empty, "0 would claim that steps were compared"
 
 
 def put(metrics: Metrics, sample: Sample) -> None:

@@ -139,6 +139,13 @@ def test_the_unit_in_a_header_is_the_unit_of_the_description(tmp_path, capsys):
     assert drafted["input"]["cmd_wheel"]["stop"] == "hold"  # as a car holds its steering
 
 
+def test_an_input_without_a_unit_names_the_entries_of_a_steering_angle(tmp_path, capsys):
+    log = steering_log(tmp_path / "drive.csv", "wheel,cmd_v,cmd_wheel")
+    assert main(["robot", "new", str(tmp_path / "my.toml"), "--from", str(log)]) == 0
+    line = next(text for text in (tmp_path / "my.toml").read_text().splitlines() if text.startswith("cmd_wheel"))
+    assert 'unit = "1"' in line and 'a steering angle has unit = "rad" and stop = "hold"' in line.partition("#")[2]
+
+
 def test_an_input_in_another_unit_than_its_speed_is_noted(tmp_path, driven, capsys):
     time, values = driven[0], driven[1].copy()
     values[:, 6] = np.degrees(values[:, 6]) * 1.2  # the robot turns more slowly than it is told to

@@ -209,6 +209,16 @@ def test_a_file_that_is_no_data_set_is_not_written_over(driven, tmp_path, capsys
     imported(path)
 
 
+@pytest.mark.parametrize("out", [True, False])
+def test_the_next_command_names_the_data_set_where_it_is_not_the_one_in_use(driven, tmp_path, capsys, monkeypatch, out):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    chosen = ["--out", str(tmp_path / "my.safetensors")] if out else []
+    assert main(["import", str(path), "--robot", str(FILE), *chosen]) == 0
+    line = "".join(capsys.readouterr().out.split("next:")[1].split())
+    assert line.startswith("brakelinecertify") and line.endswith("--use") and ("--data" in line) == out
+
+
 def test_the_unit_1_takes_a_column_as_it_is(driven, plain, tmp_path):
     path = write_csv(tmp_path / "drive.csv", *driven)
     same(plain, imported(path, "--unit", "heading=1", "v=1"), 1e-12)

@@ -1,6 +1,7 @@
 """The comparison: cells, figures by hand, and the same seed twice."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -214,6 +215,13 @@ def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
         table(changed(robot="quadrotor"))
 
 
+def test_the_help_of_the_methods_names_each_of_them(capsys):
+    with pytest.raises(SystemExit):
+        parse("compare", ["--help"])
+    words = set(re.findall(r"[\w-]+", capsys.readouterr().out))
+    assert set(compared_methods.METHODS) <= words
+
+
 def test_the_studies_of_a_comparison():
     every = cell_configs("ground", METHODS, (0, 1, 2))
     assert [s.name for s in every[:5]] == ["ddpc-s0", "sailr-s0", "secas-s0", "none-s0", "ddpc-s1"]
@@ -391,6 +399,18 @@ def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():
     assert steps_to_learn(batch, 5000) == 5000
     later = {"goal": [1] * 50, "steps": [1] * 50, "begin": range(100, 150), "end": [4000 + n for n in range(50)]}
     assert steps_to_learn({name: [*values, *later[name]] for name, values in batch.items()}, 5000) == 4038
+
+
+def test_a_training_without_a_whole_episode_has_dashes_and_its_evaluations_stay(cells, tmp_path):
+    whole = cells[METHODS[-1], SINGLE]
+    training = whole["training"] | {"episodes": {name: [] for name in whole["training"]["episodes"]}}
+    rows = table([whole | {"training": training}])
+    figures, text = next(iter(rows["parts"]["training"].values())), markdown(rows)
+    assert figures["collision rate"] is None is figures["interventions"] and figures["collisions"] == 0.0
+    assert "| collision rate | – |" in text and "no episode ended" in text and "| goal rate |" in text
+    assert "no episode ended" not in markdown(table([whole]))
+    learning_curves([whole | {"training": training}], tmp_path / "curves.png")
+    seeds_as_points(rows, tmp_path / "seeds.png")
 
 
 def test_the_goals_of_training_are_counted_in_thirds_of_the_steps():
