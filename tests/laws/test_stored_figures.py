@@ -108,8 +108,8 @@ def test_the_pages_say_how_sure_the_difference_to_the_barrier_function_is(page: 
 
 
 def sac_cells(robot: str, method: str, rate: float) -> list[dict[str, Any]]:
-    """Return the stored cells of SAC with a learning rate, wherever they are stored."""
-    folders = [path.parent for path in RESULTS.rglob(f"{robot}/table.json")]
+    """Return the stored cells of SAC with a learning rate, wherever they are stored but the longer trainings."""
+    folders = [path.parent for path in RESULTS.rglob(f"{robot}/table.json") if "plateau" not in path.parts]
     stored = [cell for folder in folders for cell in cells(str(folder.relative_to(RESULTS)), method)]
     stored = [cell for cell in stored if cell["study"]["td3"]["actor_rate"] == rate]
     assert len(set(seeds(stored))) == len(stored)
@@ -150,6 +150,8 @@ OTHERS = {  # rows of the table of other settings, with the folder and the metho
     "SAILR, η = 0.15, 300,000 steps": ("plateau/quadrotor", "sailr"),
     "SECAS, 300,000 steps": ("plateau/quadrotor", "secas"),
     "PSF, 300,000 steps": ("plateau/quadrotor", "psf"),
+    "TD3-Lagrange, 300,000 steps": ("plateau/quadrotor", "lagrange"),
+    "SAC, 300,000 steps": ("plateau/quadrotor", "sac"),
     "SAILR, η = 0.15": ("former_settings/quadrotor", "sailr"),
     "CBF-QP, α = 2": ("former_settings/quadrotor", "cbf"),
     "SECAS, margin 0.4 m": ("former_settings/quadrotor", "secas"),
