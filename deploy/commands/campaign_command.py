@@ -101,7 +101,7 @@ class CampaignCommand:
         cells = [self._prepared(robot, cell) for cell in cells]
         own = robot.task.name  # additional tasks of a robot have tables of their own
         path = self.results / f"{own}.json"
-        campaign.check_addable(campaign.table_of(path), cells, path)
+        campaign.check_addable(campaign.table_of(path), cells, path, bool(self.search))
         parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
         results = complete(parts, self.runs, self.runs, self.engine, self.again, say)
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}

@@ -255,23 +255,29 @@ def table_of(path: Path) -> dict[str, Any]:
     return {"cells": cells, "searches": searches}
 
 
-def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Path) -> None:
-    """Raise ResultError if cells of earlier campaigns would stand beside cells of another model set or policy."""
+def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Path, searched: bool = False) -> None:
+    """Raise ResultError if earlier cells or searches would stand beside cells of another model set or policy.
+
+    searched: whether the campaign searches for the worst cases of the cells, too.
+    """
     driven_again = {(cell.arena, Path(cell.policy).stem, cell.model_set, cell.perturbation) for cell in cells}
+    if searched:
+        driven_again |= {(cell.arena, "", cell.model_set, cell.perturbation) for cell in cells}
     versions = {cell.model_set: cell.model or "none" for cell in cells}
     weights = {Path(cell.policy).stem: cell.weights for cell in cells}
-    for one in table["cells"]:
+    for one in (*table["cells"], *table["searches"]):
         if _cell_key(one) in driven_again:
             continue
-        what = ""
-        if one["model"] != versions.get(one["model_set"], one["model"]):
-            what = f"the model set {one['model']}, which is now {versions[one['model_set']]}"
+        what, now = "", versions.get(one["model_set"])
+        model = one.get("model") or one.get("study", {}).get("cell", {}).get("model") or now  # older searches have none
+        if now not in (None, model):
+            what = f"the model set {model}, which is now {now}"
         elif one.get("weights") and one["weights"] != weights.get(one["policy"], one["weights"]):
             what = f"an earlier policy {one['policy']}"
         if what:
             raise ResultError(
-                f"{path} holds cells of {what}: drive these cells again in the same campaign, move the file away, or "
-                "give another --results"
+                f"{path} holds {'cells' if 'policy' in one else 'searches'} of {what}: drive these again in the same "
+                "campaign, move the file away, or give another --results"
             )
 
 

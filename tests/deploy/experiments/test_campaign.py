@@ -1,7 +1,7 @@
 """A campaign counts each episode once, goes on where it ended, keeps near misses that replay, and finds worst cases."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -193,6 +193,13 @@ def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has
     with pytest.raises(ResultError, match="holds cells of the model set another"):
         command.run()
     replace(command, arenas=("dense",)).run()
+    table = json.loads(path.read_text())
+    found = search_of(replace(CELL, arena="default", model="another"), 5)
+    about = {"arena": "default", "model_set": "residual", "perturbation": "as-recorded", "study": asdict(found)}
+    path.write_text(json.dumps(table | {"searches": [about]}))
+    for other in (command, replace(command, arenas=("dense",), search=5)):
+        with pytest.raises(ResultError, match="holds searches of the model set another"):
+            other.run()
     path.write_text("{}")
     with pytest.raises(ResultError, match="no table of a campaign"):
         command.run()
