@@ -215,7 +215,7 @@ class EvaluationPart:
         evaluation = self.evaluation
         if self.policy_file is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            path = folder / Path(evaluation.policy).name
+            path = folder / f"policy{Path(evaluation.policy).suffix}"  # the name of a run's folder may be `.`
             path.write_bytes(self.policy_file)
             evaluation = replace(evaluation, policy=str(path))
         return replace(self, evaluation=evaluation).drive(lambda stats: say(progress_line(stats)))

@@ -1,12 +1,13 @@
 """Evaluations: a batch counts the same episodes as one robot after the other, each once; a fleet shares a world."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments import batch_evaluation
-from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, parts_of
+from brakeline.deploy.experiments.evaluate import Evaluation, EvaluationPart, evaluate, parts_of
 from brakeline.deploy.run.replay_run import _joint_requests
 from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.messaging import brakeline_pb2 as pb
@@ -108,3 +109,15 @@ def test_a_file_that_is_called_like_a_policy_is_not_sent_to_the_workers(tmp_path
     assert all(part.policy_file is None for part in parts_of(GROUND, replace(TRAINED, policy=name)))
     (part,) = parts_of(GROUND, replace(TRAINED, policy=f"./{name}"))
     assert part.policy_file == b"another policy", "a path names the file"
+
+
+@pytest.mark.parametrize("name", [".", "..", "inputs.csv"])
+def test_a_worker_gets_the_policy_of_the_folder_in_which_the_command_runs(tmp_path, monkeypatch, name):
+    (tmp_path / "learner" / "checkpoint").mkdir(parents=True)
+    (tmp_path / "learner" / "policy.safetensors").write_bytes(b"a policy")
+    (tmp_path / "inputs.csv").write_bytes(b"a policy")
+    monkeypatch.chdir(tmp_path / "learner" if name == ".." else tmp_path)
+    monkeypatch.setattr(EvaluationPart, "drive", lambda part, each: Path(part.evaluation.policy))
+    (part,) = parts_of(GROUND, replace(TRAINED, policy=name))
+    policy = part.run(tmp_path / "worker", print)
+    assert policy.read_bytes() == b"a policy" and policy.suffix == Path(name).suffix
