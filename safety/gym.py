@@ -25,7 +25,7 @@ from brakeline.messaging.stated_share import percent
 from brakeline.safety.action_mapping import ActionMapping, action_for, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View, copied
 from brakeline.safety.filter.backup_plan import correction_penalty
-from brakeline.safety.gym_checks import age_of_acceleration, check_robot
+from brakeline.safety.gym_checks import age_of_acceleration, check_resets, check_robot
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.in_process import InProcess, request_observation
@@ -95,7 +95,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given. Or the environment
-                states its robot (`env.unwrapped.robot`), and its description is not that of the filter.
+                states its robot (`env.unwrapped.robot`), and its description is not that of the filter. Or a wrapper
+                inside resets the environment by itself.
             TooLoose: the validation report states a larger probability, or there is no report. With a client of a
                 service, `step` raises it, since only the answers state the probability.
             ValueError: `accept_bound` is not above 0 and at most 1, or the penalty is negative or not finite.
@@ -109,6 +110,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self.client = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
         self._limit = 1.0 if accept_bound is None else _checked_limit(self.client, accept_bound)
         check_robot(env, self.client.robot)
+        check_resets(env)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
         check_numbers(self, "penalty", least=0.0)
         self.backup_plan.turn_aside |= turn_aside

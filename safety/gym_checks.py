@@ -6,11 +6,13 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.robot import Array, Robot
 
+AUTORESETS = "Autoreset", "AutoResetWrapper"  # of Gymnasium 1, and of older versions
 UNSHARED = {"accept_bound"}  # in a description: a limit for the model set, which says nothing about the robot
 
 
@@ -30,6 +32,21 @@ def check_robot(env: Any, robot: Robot) -> None:
         f"the environment has the robot {simulated.name}, the filter was made for {robot.name}: their {differ}. "
         "Give both the same description; `brakeline certify DESCRIPTION --use` makes the model set of a description"
     )
+
+
+def check_resets(env: Any) -> None:
+    """Check that no wrapper inside resets the environment by itself, since a backup plan begins at each reset.
+
+    Raises:
+        Mismatch: one does; the message says where to put it.
+    """
+    while isinstance(env, gymnasium.Wrapper):
+        if (name := type(env).__name__) in AUTORESETS:
+            raise Mismatch(
+                f"{name} inside the wrapper resets the environment unseen: the filter would take the new start for a "
+                f"jump of the robot, and widen its sets. Instead, put {name} around the SafetyWrapper"
+            )
+        env = env.env
 
 
 def age_of_acceleration(infos: Mapping[str, Any], given: float | None, otherwise: float, method: Any) -> float:

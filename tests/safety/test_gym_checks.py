@@ -47,6 +47,17 @@ def test_a_filter_of_another_body_is_refused(wrap: Wrap) -> None:
         wrap(robot=WIDE)
 
 
+def test_an_environment_that_resets_itself_is_refused() -> None:
+    """A reset that the wrapper does not see looks like a jump of the robot: the sets would widen a thousandfold."""
+    with pytest.raises(Mismatch, match=r"Autoreset inside .* put Autoreset around the SafetyWrapper"):
+        SafetyWrapper(
+            gymnasium.wrappers.TransformReward(gymnasium.wrappers.Autoreset(NavigationEnv(GROUND)), abs), SAFETY
+        )
+    env = gymnasium.wrappers.Autoreset(one())
+    env.reset(seed=0)
+    assert env.step(np.zeros(2))[4]["safety"].verified
+
+
 def test_the_state_of_one_environment_is_refused_for_a_vector() -> None:
     env = vector(state=lambda _, observations, infos: observations[0])
     env.reset(seed=0)
