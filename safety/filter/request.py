@@ -99,9 +99,10 @@ class Request(ComparedByValue):
     acceleration_age: float = 0.0
 
     def __post_init__(self) -> None:
-        """Convert arrays to the type and the memory layout that compiled code needs."""
+        """Convert arrays to the type and the memory layout that compiled code needs; copy those that are read-only."""
         for name in ("state", "action", "input_in_force", "plan"):
-            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+            array = np.ascontiguousarray(getattr(self, name), dtype=float)
+            object.__setattr__(self, name, array if array.flags.writeable else array.copy())
 
     @property
     def finite(self) -> bool:

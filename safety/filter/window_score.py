@@ -32,5 +32,5 @@ class WindowScore:
         The first number counts all errors, the second only those of `scored_coordinates`.
         """
         states = np.concatenate([past.states, state[None]])
-        score, of_plan = self._score(states, np.ascontiguousarray(past.inputs), *self._sets)
+        score, of_plan = self._score(states, np.require(past.inputs, float, ("C", "W")), *self._sets)
         return (score / self._start, of_plan / self._start) if past.from_start else (score, of_plan)

@@ -12,6 +12,7 @@ from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.request import MOST_OBSERVED, FastRequestCheck, Request, check_for_filter
+from brakeline.safety.service.in_process import InProcess
 from tests.safety.asked import cylinder, request, same
 from tests.safety.toys import car
 
@@ -99,9 +100,13 @@ def test_the_type_and_layout_of_arrays_do_not_change_the_decision(ready):
     sound = request(action=(0.25, 0.5), obstacles=[cylinder(1.0, 0.0)])
     expected = ready.decide(sound)
     stridden = {name: np.repeat(getattr(sound, name), 2, axis=0)[::2] for name in ("state", "action", "input_in_force")}
-    for odd in (stridden, {name: value.astype(np.float32) for name, value in stridden.items()}):
+    single = {name: value.astype(np.float32) for name, value in stridden.items()}
+    # as NumPy sees an array of JAX, or a message's bytes
+    fixed = {name: np.frombuffer(value.tobytes()) for name, value in stridden.items()}
+    for odd in (stridden, single, fixed):
         assert same(ready.decide(replace(sound, **odd)), expected)
     assert same(ready.decide(replace(sound, plan=sound.plan.astype(int))), expected)
+    assert InProcess(ready, 1.0).decide(fixed["state"], fixed["action"], known_free=True).verified
     rest, whole = ready.standing_reservation(np.zeros(5)), ready.standing_reservation(np.zeros(5, np.float32))
     assert np.array_equal(rest.center, whole.center) and np.array_equal(rest.half_width, whole.half_width)
 

@@ -103,6 +103,8 @@ def test_sets_are_wider_at_an_episodes_start_and_windows_from_there_are_judged_b
     ask = request(np.zeros(5), np.array([0.2, 0.1]), np.zeros(2), POSTS)
     past = PastWindow(np.zeros((ROBOT.horizon, 5)), np.full((ROBOT.horizon + 1, 2), 0.01))
     at_start, later = safety.decide(ask), safety.decide(replace(ask, past=past))
+    fixed = PastWindow(past.states, np.frombuffer(past.inputs.tobytes()).reshape(past.inputs.shape))
+    assert safety.decide(replace(ask, past=fixed)) == later, "a read-only array"
     noise = np.array(ROBOT.measurement_bound[:2])
     assert at_start.tube_half_width - noise == pytest.approx(1.5 * (later.tube_half_width - noise))
     assert at_start.margin < later.margin
