@@ -75,12 +75,17 @@ def mean(values: Sequence[ArrayLike], seed: int = 0, *, crossed: bool = False) -
 
 
 def rate(happened: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimate:
-    """Estimate the probability of an event from 0 and 1, one array (episodes,) per seed; see `ratio`.
+    """Estimate the probability of an event from 0 and 1, one array (episodes,) per seed; see `share`."""
+    return share(happened, [np.ones(len(np.asarray(of_seed))) for of_seed in happened], crossed=crossed)
 
-    If it never or always happened, all resamples are alike: then the interval is the exact one of Clopper and Pearson,
-    which takes all episodes as independent.
+
+def share(hits: Sequence[ArrayLike], of: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimate:
+    """Estimate the share of hits in steps, counted by episode, one array (episodes,) per seed each; see `ratio`.
+
+    If all steps or none are hits, all resamples are alike: then each episode counts as one trial, and the interval is
+    the exact one of Clopper and Pearson, which takes all episodes as independent.
     """
-    estimate, episodes = mean(happened, crossed=crossed), sum(len(np.asarray(of_seed)) for of_seed in happened)
+    estimate, episodes = ratio(hits, of, crossed=crossed), sum(len(np.asarray(of_seed)) for of_seed in hits)
     if 0.0 < estimate.value < 1.0:
         return estimate
     low, high = clopper_pearson(round(estimate.value * episodes), episodes) or (0.0, 1.0)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio
+from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio, share
 from brakeline.deploy.experiments.compared_methods import NONE, compared, in_order
 from brakeline.deploy.experiments.comparison_cells import TrialConfig
 from brakeline.deploy.experiments.episode_table import CONTACTS
@@ -94,7 +94,7 @@ def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
         "mean speed [m/s]": ratio(values["speed"], values["steps"], crossed=True),
         "max speed [m/s]": max(map(max, values["fastest"])),
         "mean reward": mean(values["reward"], crossed=True),
-        "interventions": ratio(values["interventions"], values["steps"], crossed=True),
+        "interventions": _interventions(values, trial.split("-")[1], crossed=True),
         "decision [ms]": float(np.mean([t["mean"] for t in times])),
         "its std [ms]": float(np.mean([t["std"] for t in times])),
     }
@@ -110,12 +110,18 @@ def training_rows(results: Sequence[Result]) -> Row:
         "collisions": float(np.mean([sum(counts) for counts in values["collision"]])),
         "steps to 90 % goals": mean([[value] for value in learned]),
         "seeds that got there": sum(value < limit for value, limit in zip(learned, steps, strict=True)),
-        "interventions": ratio(values["interventions"], values["steps"]),
+        "interventions": _interventions(values, compared(results[0]["study"]["method"]).filter),
         CUT: rate([was_cut(training["episodes"]) for training in trainings]),
         "pre-training samples": 0 if model is None else int(model["samples"]),
         "pre-training collisions": 0 if model is None else int(model["collisions"]),
         **_goals_by_third(trainings),
     }
+
+
+def _interventions(values: dict[str, list[list[float]]], method: str, *, crossed: bool = False) -> MeanEstimate:
+    """Return the share of steps with an intervention of a method that filters. Of the method `none`, 0 is certain."""
+    estimate = ratio if method == NONE else share
+    return estimate(values["interventions"], values["steps"], crossed=crossed)
 
 
 def _goals_by_third(trainings: Sequence[Result]) -> Row:

@@ -33,6 +33,7 @@ from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds
 from brakeline.deploy.experiments.comparison_table import (
     THIRDS,
     _goals_by_third,
+    evaluation_rows,
     markdown,
     plain,
     steps_to_learn,
@@ -284,6 +285,16 @@ def test_a_rate_without_an_event_has_an_exact_interval():
     assert (never.value, never.low) == (0.0, 0.0) and never.high == pytest.approx(1.0 - 0.025 ** (1 / 150))
     assert (always.value, always.high) == (1.0, 1.0) and always.low == pytest.approx(0.025 ** (1 / 150))
     assert rate(once) == mean(once)
+
+
+@pytest.mark.parametrize(("filtering", "high"), [("ddpc", 1.0 - 0.025 ** (1 / 80)), ("none", 0.0)])
+def test_a_filter_that_never_intervened_has_an_interval(filtering, high):
+    """It may intervene in another episode, as the caption of the table says. Without a filter, nothing can."""
+    episodes = {name: [0] * 40 for name in ("goal", "collision", "fastest", "speed", "reward", "interventions")}
+    evaluation = {"episodes": episodes | {"steps": [50] * 40}, "decision_ms": {"mean": 1.0, "std": 0.0}}
+    trial = f"trained-{filtering}-dense"
+    estimate = evaluation_rows([{"evaluations": {trial: evaluation}}] * 2, trial)["interventions"]
+    assert (estimate.value, estimate.low, estimate.high) == (0.0, 0.0, pytest.approx(high))
 
 
 def test_a_ratio_is_of_sums_and_of_seeds_alike():
