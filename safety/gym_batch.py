@@ -90,8 +90,12 @@ class BatchSafetyWrapper(VectorWrapper):
         return observations, infos
 
     def _keep(self, observations: Any, infos: dict[str, Any]) -> None:
-        """Keep what the next requests are about. A policy may overwrite the states that it gets."""
-        self._infos, self._observations = infos | {"state": infos["state"].copy()}, observations
+        """Keep what the next requests are about, as copies.
+
+        A policy may overwrite what it gets, and the next reset overwrites the obstacles, which decisions refer to.
+        """
+        own = {"state": infos["state"].copy(), "obstacles": {n: part.copy() for n, part in infos["obstacles"].items()}}
+        self._infos, self._observations = infos | own, observations
 
     def step(self, actions: Any) -> StepBatch:
         self.begin_step(actions)

@@ -15,12 +15,12 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan, correction_penalty
-from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+from brakeline.safety.filter.batch.decision_arrays import KINDS, DecisionArrays
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, correction_penalties
 from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import ALLOWED, FAILSAFE
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
 from brakeline.safety.filter.widening import WINDOWS, Widening
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.service.in_process import InProcess
@@ -228,9 +228,25 @@ def test_an_environment_that_overwrites_its_inputs_changes_no_figure() -> None:
     env.reset(seed=0)
     *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
     assert np.array_equal(infos["executed"], env.plans.input_in_force) and not infos["penalty"].any()
-    infos["state"][:] = 3.0
+    infos["state"][:], infos["obstacles"]["count"][:] = 3.0, 0
     *_, infos = env.step(np.tile([0.2, 0.0], (2, 1)))
     assert infos["outcome"].answers.contained.all(), "a policy that overwrites a state changes no request"
+    assert infos["outcome"].answers.obstacles.count.all(), "nor one that overwrites the obstacles"
+    env.close()
+
+
+def test_a_decision_names_the_obstacle_of_its_own_arena_also_after_a_reset() -> None:
+    env = BatchSafetyWrapper(BatchNavigationEnv(GROUND, 8, "dense"), SAFETY, turn_aside=True)
+    env.reset(seed=0)
+    adjusted = 0
+    while not adjusted:
+        *_, infos = env.step(np.tile([0.25, 0.0], (8, 1)))
+        adjusted = (infos["outcome"].answers.kind == KINDS.index(ADJUSTED)).sum()
+    answers = infos["outcome"].answers
+    before, center = [answers.row(i).blocked_by for i in range(8)], answers.obstacles.center.copy()
+    env.reset(seed=1)
+    assert [answers.row(i).blocked_by for i in range(8)] == before
+    assert np.array_equal(answers.obstacles.center, center)
     env.close()
 
 
