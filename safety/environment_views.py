@@ -42,9 +42,15 @@ STATE, OBSTACLES = in_info("state"), _obstacles
 
 
 def copied(value: Any) -> Any:
-    """Return an observation or an info with copies of its arrays: a policy may overwrite those that it gets."""
+    """Return an observation or an info with copies of its arrays and lists: a policy may overwrite those it gets."""
     if isinstance(value, np.ndarray):
-        return value.copy()
+        whole = value.copy()
+        if value.dtype.hasobject:  # such as a list of obstacles for each environment
+            for place, part in np.ndenumerate(value):
+                whole[place] = copied(part)
+        return whole
     if isinstance(value, dict):
         return {name: copied(part) for name, part in value.items()}
+    if type(value) is list:
+        return value.copy()  # not its parts: it may hold thousands of numbers
     return tuple(map(copied, value)) if type(value) is tuple else value

@@ -206,6 +206,32 @@ def test_a_policy_that_overwrites_what_it_observes_changes_no_decision(ready, ma
         assert np.array_equal(info["safety"], wanted["safety"]) if many else info["safety"] == wanted["safety"]
 
 
+class Listing(Toy):
+    """It reports the state, and an obstacle in a list."""
+
+    def reset(self, **how):
+        return self._listed(*super().reset(**how))
+
+    def step(self, action):
+        *returned, info = super().step(action)
+        return *returned, self._listed(returned[0], info)[1]
+
+    def _listed(self, observation, info):
+        return observation, info | {"state": observation, "obstacles": [Obstacle("cylinder", (1.0, 0.0), (0.1,))]}
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_policy_that_empties_the_list_of_obstacles_frees_no_space(ready, many):
+    """An empty list means that all space is free. A policy may take the obstacles out of the list one by one."""
+    env, sound = (wrapped(Listing(CAR), ready, many, actions=normalised(CAR)) for _ in range(2))
+    info, action = env.reset(seed=0)[1], np.full((1, 2) if many else 2, 0.3, np.float32)
+    sound.reset(seed=0)
+    for _ in range(3):
+        (info["obstacles"][0] if many else info["obstacles"]).clear()
+        (*_, info), (*_, wanted) = env.step(action), sound.step(action)
+        assert info["diagnostics"]["margin"] == wanted["diagnostics"]["margin"]
+
+
 @pytest.mark.parametrize("centimetres", [0, 28, 29, 57, 58, 60])
 def test_an_action_in_whole_units_is_the_input_that_was_decided(centimetres):
     space = gymnasium.spaces.Box(0, 60, (2,), np.int32)
@@ -450,7 +476,7 @@ def test_a_masked_reset_leaves_the_other_robots_as_they_are(ready):
     assert not env.backup_plans[0].input_in_force.any() and env.backup_plans[0].predicted is None
     assert env.backup_plans[1].plan is plan and env.backup_plans[1].predicted is predicted
     assert np.array_equal(after["state"], observations) and after["_state"].all()
-    assert np.array_equal(after["state"][1], infos["state"][1]) and after["obstacles"][1] is infos["obstacles"][1]
+    assert np.array_equal(after["state"][1], infos["state"][1]) and after["obstacles"][1] == infos["obstacles"][1]
     assert env._scans[1] is scan, "no time passes"
     *_, infos = env.step(np.ones((2, 2), np.float32))
     assert infos["safety"][1].compared and infos["safety"][1].contained
