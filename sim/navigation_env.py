@@ -326,7 +326,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "state": period.measured,
             "true_state": period.true,
             "outside": self._outside(period),
-            "input_in_force": self.vehicle.input,
+            "input_in_force": self.vehicle.input.copy(),  # a policy may overwrite it, and the slew begins at it
             "obstacles": obstacles,
             **scan,
             "arena": self._arena,

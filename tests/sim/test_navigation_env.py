@@ -159,6 +159,19 @@ def test_the_episode_seed_determines_the_episode(make: Make) -> None:
     assert env.reset(options={"episode_seed": 5})[1]["episode_seed"] == 5
 
 
+@pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.name)
+def test_a_policy_that_overwrites_what_it_gets_changes_no_motion(robot: RobotWithTask) -> None:
+    env, sound = (NavigationEnv(robot, "dense") for _ in range(2))
+    info, _ = env.reset(seed=0)[1], sound.reset(seed=0)
+    for _ in range(2):
+        for entry in info.values():
+            if isinstance(entry, np.ndarray):
+                entry[...] = 7.0
+        *_, info = env.step(0.3 * robot.high())
+        *_, wanted = sound.step(0.3 * robot.high())
+        assert all(np.array_equal(info[name], wanted[name]) for name in ("true_state", "state", "input_in_force"))
+
+
 def test_a_task_without_an_arena_called_default_begins_in_its_first_one() -> None:
     task = GROUND.task
     mine = with_task(GROUND, replace(task, arenas={"hall": task.arenas["open"], "yard": task.arenas["dense"]}))
