@@ -16,6 +16,7 @@ from brakeline.errors import BadInput, BadWeights, NoSource, UnknownTask
 from brakeline.messaging.policy_weights import MLP, POLICY
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.task_code import is_own_code, load_code
+from brakeline.safety.environment_views import copied
 from brakeline.sim.scripted_policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
@@ -64,7 +65,7 @@ def _own_policy(place: str, robot: RobotWithTask, generator: np.random.Generator
         raise UnknownTask(f"an object of {place} cannot be called with (observation, info): define __call__")
 
     def checked(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
-        action = np.asarray(policy(observation, info), dtype=float)
+        action = np.asarray(policy(copied(observation), copied(info)), dtype=float)  # the next request is about those
         if action.shape != (robot.action_dim,):
             inputs = ", ".join(robot.action)
             raise BadInput(

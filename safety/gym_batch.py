@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from brakeline.errors import Mismatch
 from brakeline.messaging.number_checks import check_numbers
+from brakeline.safety.environment_views import copied
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
 from brakeline.safety.gym_checks import age_of_acceleration, check_robot, check_rows
@@ -95,7 +96,7 @@ class BatchSafetyWrapper(VectorWrapper):
         A policy may overwrite what it gets, and the next reset overwrites the obstacles, which decisions refer to.
         """
         own = {"state": infos["state"].copy(), "obstacles": {n: part.copy() for n, part in infos["obstacles"].items()}}
-        self._infos, self._observations = infos | own, observations
+        self._infos, self._observations = infos | own, copied(observations)
 
     def step(self, actions: Any) -> StepBatch:
         self.begin_step(actions)

@@ -261,7 +261,8 @@ def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Pa
     searched: whether the campaign searches for the worst cases of the cells, too.
     """
     driven_again = {(cell.arena, Path(cell.policy).stem, cell.model_set, cell.perturbation) for cell in cells}
-    driven_again |= {(arena, "", *others) for arena, _, *others in driven_again if searched}
+    if searched:
+        driven_again |= {(cell.arena, "", cell.model_set, cell.perturbation) for cell in cells}
     versions = {cell.model_set: cell.model or "none" for cell in cells}
     weights = {Path(cell.policy).stem: cell.weights for cell in cells}
     for one in (*table["cells"], *table["searches"]):

@@ -150,7 +150,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         episodes = [self._episode_seeds(i) if given is None else given[i] for i in rows.tolist()]
         self._now = self._join(rows, *self._begin(rows, episodes))
         check_observation(self.robot, self._now[0].shape[1])
-        return self._now
+        return _own(self._now[0]), _own(self._now[1])
 
     def __getstate__(self) -> dict[str, Any]:
         """Refuse a copy. Raises TypeError: the threads and the physics of many robots cannot be copied."""
@@ -238,7 +238,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             episodes = [self._episode_seeds(i) for i in resets.tolist()]
             observations, infos = self._join(resets, *self._begin(resets, episodes))
         self._now = observations, infos
-        return observations, rewards, terminated, truncated, infos | final
+        return _own(observations), rewards, terminated, truncated, _own(infos) | final
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the threads."""
@@ -317,6 +317,13 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             "speed": self._observations.speeds(period.true),
             "episode_seed": self._seeds[rows],
         }
+
+
+def _own(values: Any) -> Any:
+    """Return a copy of an array, or of the arrays of infos: a policy may overwrite what it gets."""
+    if isinstance(values, dict):
+        return {name: _own(part) if isinstance(part, np.ndarray) else part for name, part in values.items()}
+    return values.copy()
 
 
 def vehicle_batch(

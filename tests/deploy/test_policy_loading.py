@@ -38,6 +38,13 @@ class Agent:
 def steady(observation, info):
     return [0.1, 0.2]
 
+def greedy(observation, info):
+    observation *= 2.0
+    info["state"][:] = 0.0
+    while info["obstacles"]:
+        info["obstacles"].pop()
+    return [0.1, 0.2]
+
 def alone():
     pass
 
@@ -60,6 +67,16 @@ def test_a_class_or_a_function_in_a_file_of_your_own_is_a_policy(tmp_path, monke
     assert np.allclose(first, 0.5 * GROUND.high(), atol=1e-3)
     assert policy_named("agent.py:steady", GROUND, 0)(None, {}).tolist() == [0.1, 0.2]
     assert np.array_equal(first, again) and not np.array_equal(first, other), "the seed decides"
+
+
+def test_a_policy_of_your_own_that_overwrites_what_it_gets_changes_no_request(tmp_path, monkeypatch):
+    """The filter decides with the same state and obstacles: an empty list means that all space is free."""
+    (tmp_path / "agent.py").write_text(AGENT)
+    monkeypatch.chdir(tmp_path)
+    observation, info = np.ones(3, np.float32), {"state": np.ones(5), "obstacles": ["a post"]}
+    policy_named("agent.py:greedy", GROUND, 0)(observation, info)
+    assert observation.all() and observation.max() == 1.0
+    assert info["state"].all() and info["obstacles"] == ["a post"]
 
 
 @pytest.mark.parametrize(

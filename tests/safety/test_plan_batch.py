@@ -269,6 +269,19 @@ def test_a_decision_names_the_obstacle_of_its_own_arena_also_after_a_reset() -> 
     env.close()
 
 
+def test_a_policy_that_overwrites_its_observations_changes_none_that_a_rival_reads() -> None:
+    method, read = RowByRow(SAFETY), []
+    decide = method.decide_batch
+    method.decide_batch = lambda requests: read.append(requests.observation) or decide(requests)  # type: ignore
+    env = BatchSafetyWrapper(BatchNavigationEnv(GROUND, 2, "open"), method)
+    observations, _ = env.reset(seed=0)
+    seen = observations.copy()
+    observations[:] = 0.5
+    env.step(np.tile([0.2, 0.0], (2, 1)))
+    assert np.array_equal(read[0], seen)
+    env.close()
+
+
 @pytest.mark.parametrize("options", [None, {}, {"reset_mask": None}, {"reset_mask": np.ones(2, dtype=bool)}])
 def test_a_reset_of_all_robots_begins_all_plans_anew(options: Any) -> None:
     env = BatchSafetyWrapper(BatchNavigationEnv(GROUND, 2, "open"), SAFETY)

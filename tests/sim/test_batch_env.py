@@ -157,6 +157,18 @@ def test_a_final_info_has_the_obstacles_of_its_own_arena() -> None:
     batch.close()
 
 
+def test_a_masked_reset_returns_what_the_other_robots_saw_whatever_a_policy_made_of_it() -> None:
+    batch = BatchNavigationEnv(GROUND, 2, "dense", autoreset_mode=AutoresetMode.DISABLED)
+    batch.reset(seed=1)
+    observations, *_, infos = batch.step(np.tile([0.2, 0.0], (2, 1)))
+    seen, state = observations[1].copy(), infos["state"][1].copy()
+    observations -= 1.0  # as a policy that normalises in place
+    infos["state"] -= 1.0
+    observations, infos = batch.reset(options={"reset_mask": np.array([True, False])})
+    assert np.array_equal(observations[1], seen) and np.array_equal(infos["state"][1], state)
+    batch.close()
+
+
 def test_noise_is_that_of_each_generator() -> None:
     streams = NormalStreams(3)
     for row in range(3):
