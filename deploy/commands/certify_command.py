@@ -319,8 +319,8 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
     ]
     if s.chosen is not None and s.marginal is not None:
         lines += [
-            f"  a plan like these: {s.marginal:.2%} leave their tube on average (from plans that overlap; more if "
-            "ground, load or battery change slowly, because minutes hold few such changes)",
+            f"  a plan like these: about {percent(s.marginal)} or fewer leave their tube on average (more if ground, "
+            "load or battery change slowly, because minutes hold few such changes)",
             f"  predictor: {s.chosen.features} features, selected from products of up to {s.chosen.degree} variables, "
             + ("with" if s.chosen.lags else "without")
             + " the earlier input; 99 % of "
@@ -343,11 +343,11 @@ def group_table(report: ValidationReport) -> StackingTable:
     """Return the statement of a validation report by kind of driving (docs/method.md §14)."""
     table = StackingTable(title="by kind of driving")
     table.add_column("driving")
-    for column in ("windows", "plans", "violations", "on average", "≤ per plan", "≤ per step", "largest error"):
+    for column in ("windows", "plans", "violations", "≤ on average", "≤ per plan", "≤ per step", "largest error"):
         table.add_column(column, justify="right")
     for group in report.groups:
         counts = str(group.windows), str(group.plans), str(group.violations)
-        shares = f"{group.marginal:.2%}", percent(group.bound), percent(group.bound_step)
+        shares = percent(group.marginal), percent(group.bound), percent(group.bound_step)
         table.add_row(group.name, *counts, *shares, f"{group.excess:.0%} of its set")
     table.caption = "windows may overlap, plans and steps do not; bounds at 99 % confidence"
     return table

@@ -60,7 +60,7 @@ class GroupStatement:
         windows: number of windows of this kind, which may overlap.
         plans: number of them that do not overlap.
         violations: number of `plans` outside their tubes.
-        marginal: expected share of new windows outside.
+        marginal: about the largest share of new plans outside to expect.
         bound: the largest share of plans outside, at 99 % confidence.
         excess: the largest ratio of an error to its bound.
         step_violations: number of `windows` whose first step was outside.
@@ -116,7 +116,7 @@ class ValidationReport:
     bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
     inflation: float = 1.0  # factor on the envelopes of the model set
     leaving: tuple[ViolationGroup, ...] = ()  # the violations by coordinate and driving regime
-    marginal: float | None = None  # mode one-step: expected share of new plans outside, from windows that may overlap
+    marginal: float | None = None  # mode one-step: the share of new plans outside to expect, or more
     groups: tuple[GroupStatement, ...] = ()  # mode one-step: the statement by kind of driving
     chosen: Candidate | None = None  # mode one-step: the chosen features
     candidates: tuple[Candidate, ...] = ()  # mode one-step: all features tried, from the best to the worst
@@ -269,14 +269,14 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
         condition=calibration.condition,
         excess=float(scores.max(initial=0.0)),
         inflation=calibration.factor,
-        marginal=_marginal(outside),
+        marginal=_marginal(outside[apart]),
         groups=tuple(
             GroupStatement(
                 name,
                 int(kind.sum()),
                 int((kind & apart).sum()),
                 int((kind & apart & outside).sum()),
-                _marginal(outside[kind]),
+                _marginal(outside[kind & apart]),
                 upper_bound(int((kind & apart & outside).sum()), int((kind & apart).sum())),
                 float(scores[kind].max(initial=0.0)),
                 int((kind & first_outside).sum()),
@@ -314,7 +314,10 @@ def _statement(model: ModelSet, plans: tuple[int, int], steps: tuple[int, int], 
 
 
 def _marginal(outside: NDArray[np.bool_]) -> float:
-    """Return the expected share of new windows outside, from exchangeable windows of which these were outside."""
+    """Return about the largest share of new plans outside to expect, from plans (n,) of which these were outside.
+
+    Windows that overlap are not exchangeable: errors that last as long as a plan are in many windows, or in none.
+    """
     return (int(outside.sum()) + 1) / (len(outside) + 1)
 
 
