@@ -248,4 +248,4 @@ def _describe_velocity(before: Array, now: Array) -> tuple[str, str] | None:
     if len(aside) == 3 and abs(aside[2]) > UPRIGHT * float(np.linalg.norm(aside)):
         return ("climbed" if aside[2] > 0.0 else "sank"), "straight on"
     left = before[0] * now[1] - before[1] * now[0] > 0.0
-    return f"turned aside to the {'left' if left else 'right'}", "straight on"
+    return f"turned to the {'left' if left else 'right'} of the proposal", "straight on"

@@ -123,7 +123,7 @@ class RobotCommand:
         rows = [(f"input {label}", _input_text(one)) for label, one in values["inputs"].items()]
         for name, value in values.items():
             if name != "inputs":
-                text = "\n".join(value) if isinstance(value, list) else value
+                text = "\n".join(value) if isinstance(value, list) else "not known" if value is None else value
                 text = f"{text:g}" if isinstance(text, float) else str(text)
                 rows.append((_label(name), text))
         print_result(self.json, values, plain_table((), rows))

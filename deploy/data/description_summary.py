@@ -17,9 +17,14 @@ def full_stop_inputs(robot: Robot) -> Array:
     return np.asarray(robot.plan_matrix() @ np.tile(largest, robot.free_steps)).reshape(robot.horizon, -1)
 
 
-def nominal_stopping_distance(robot: Robot) -> float:
-    """Return the length in m of a full stop of a robot without lag: an order of magnitude, not a bound."""
+def nominal_stopping_distance(robot: Robot) -> float | None:
+    """Return the length in m of a full stop of a robot without lag: an order of magnitude, not a bound.
+
+    Return None if no input is a speed, as for a robot that takes accelerations: its largest speed is not known.
+    """
     speeds = [i for i, label in enumerate(robot.action) if label.endswith("[m/s]") and robot.translates[i]]
+    if not speeds:
+        return None
     return float(np.linalg.norm(np.abs(full_stop_inputs(robot)[:, speeds]).sum(0))) * robot.period
 
 
@@ -39,7 +44,10 @@ def stands_somewhere(robot: Robot) -> bool:
 
 def remarks(robot: Robot) -> list[str]:
     """Return remarks on settings that are valid but probably not intended."""
-    distance, no_standing = nominal_stopping_distance(robot), robot.horizon == robot.free_steps + robot.brake_steps
+    distance, no_standing = (
+        nominal_stopping_distance(robot) or 0.0,
+        robot.horizon == robot.free_steps + robot.brake_steps,
+    )
     free = [label for label, index in zip(robot.action, robot.follows, strict=True) if index < 0]
     candidates = (
         (

@@ -20,7 +20,7 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     """Return the template with the values that the log shows; comments mark values that it does not show."""
     brake, late = brake_periods(schema.period, schema.states, schema.inputs)
     horizon, brake = min(1 + brake + late + 1, MOST_PERIODS), min(brake, MOST_PERIODS - 2)
-    states = [f"# error: {UNKNOWN}.", *map(_state, schema.states)]
+    states = [f"# error: {UNKNOWN}.", *(_state(one, schema.period) for one in schema.states)]
     inputs = ["# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more."]
     inputs += [*map(_input, schema.inputs)] if schema.inputs else [f"# Inputs {UNKNOWN}: these come from the template."]
     zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
@@ -49,13 +49,14 @@ def _verbatim(*lines: str) -> str:
     return "".join(f"{line}\n" for line in lines).replace("\\", r"\\")
 
 
-def _state(one: InferredColumn) -> str:
+def _state(one: InferredColumn, period: float) -> str:
     values: dict[str, Any] = {"unit": one.unit or "1"}
     values |= {"role": one.role} if one.role != "other" else {}
     values |= {"error": ERRORS.get(one.role, ERROR)} | ({"follows": one.follows} if one.follows else {})
     remarks = [f"{one.least:.3g} to {one.most:.3g} in the log"] if one.role != "heading" else []
     remarks += [] if one.unit else [f"its unit {UNKNOWN}"]
-    remarks += [f"{1e3 * one.delay:.0f} ms after its input"] if one.delay is not None else []
+    if one.delay is not None:
+        remarks.append(f"{1e3 * one.delay:.0f} ms after its input: {one.delay / period:.1f} periods")
     remarks += [f"brakes by {one.change:.2g} a period"] if one.follows and one.change else []
     return _line(one.name, values, remarks)
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from brakeline.deploy.data.log_options import PLAIN, LogOptions
-from brakeline.deploy.data.message_columns import with_message_fields
+from brakeline.deploy.data.message_columns import fields_of, with_message_fields
 from brakeline.deploy.data.resample import HOLD, ImportedData, ImportReport, resample
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.sources.isolated_reader import read_isolated
@@ -65,7 +65,8 @@ def with_time(tables: list[Table], path: Path, options: LogOptions) -> list[Tabl
     def timed(table: Table) -> Table:
         if table.name:  # a topic or a type of messages: the reader has set its time
             return table
-        return with_message_fields(stamped(in_header_units(table, given), column, unit))
+        named = [*given, *fields_of(given, table)]
+        return with_message_fields(stamped(in_header_units(table, named), column, unit))
 
     return options.ranked([replace(timed(table), source=path.name) for table in tables])
 

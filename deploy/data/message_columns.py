@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.unit_table import split_header
 
 # The last part of a column's name, and the name that a description has for it.
 FIELDS = {
@@ -16,6 +18,13 @@ FIELDS = {
 }
 QUATERNION = {part: rf"(?:orientation[._]|^q_rs_|^q_?){part}" for part in "xyzw"}
 HEADING = "heading"
+
+
+def fields_of(names: Iterable[str], table: Table) -> list[str]:
+    """Return the columns, without the units of their headers, to which `with_message_fields` gives some names."""
+    patterns = [FIELDS[name] for name in names if name in FIELDS and name not in table.columns]
+    plain = [split_header(column)[0] for column in table.columns]
+    return [column for column in plain if any(re.search(rf"{one}$", column, re.IGNORECASE) for one in patterns)]
 
 
 def with_message_fields(table: Table) -> Table:

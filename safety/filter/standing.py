@@ -13,8 +13,8 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.model.model_set import extra_coordinates
 
 DRIVES_ALREADY = (
-    "the robot drives already, and its first request names the input of a robot that stands: nothing is known of the "
-    "true one"
+    "the robot drives already, and the request names the input of a robot that stands, without a predicted set, as the "
+    "first request does, and one after a period without a decision: nothing is known of the true input"
 )
 
 
@@ -50,7 +50,8 @@ def stands(request: Request, local_map: LocalMap, constraints: TubeConstraints, 
 def may_drive_already(request: Request, robot: Robot) -> bool:
     """Return whether this may be the first request of a program, about a robot that drives already.
 
-    Such a request names the input in force of a standing robot, and nobody knows the true one. A robot whose measured
+    Such a request names the input in force of a standing robot, and nobody knows the true one. A request after a period
+    without a decision looks the same: something moves the robot, although its plan is to stand. A robot whose measured
     speeds are no more than their errors counts as standing. Whether another one drives, `stands` says.
     """
     if request.predicted is not None or not request.names_standing(robot):

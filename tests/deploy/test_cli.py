@@ -445,7 +445,13 @@ def test_show_prints_a_description(command, figures, robot):
     assert {one["slew"] for one in shown["inputs"].values()} == {{"ground": None, "quadrotor": 0.8}[robot]}
     assert shown["horizon"] == {"ground": 3, "quadrotor": 12}[robot]
     out = command("robot", "show", robot)[1]
-    assert "[m/s]" in out and "layout" in out
+    assert "[m/s]" in out and "layout" in out and shown["way_to_a_stop_m"] > 0.0
+
+
+def test_the_way_to_a_stop_is_not_known_if_no_input_is_a_speed(command, figures):
+    car = Path(__file__).parents[2] / "examples" / "bullet_safety_gym" / "racecar.toml"
+    assert figures("robot", "show", car)["way_to_a_stop_m"] is None
+    assert re.search(r"way to a stop \[m\] +not known", command("robot", "show", car)[1])
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,11 @@ def test_nothing_is_verified_before_the_input_in_force_of_a_robot_that_flies_is_
     client = InProcess(ready)
     for kind in (FAILSAFE, ALLOWED):  # it brakes for one period, and then its input is known
         assert client.decide(flies, first[0].action, known_free=True).kind == kind
+    client = InProcess(ready)
+    client.decide(hovers, np.zeros(3), known_free=True)
+    client.fallback()  # something moves it meanwhile: this is no first request, and the reason fits it all the same
+    answer = client.decide(flies, np.zeros(3), known_free=True)
+    assert answer.reason == DRIVES_ALREADY and "after a period without a decision" in answer.reason
 
 
 @pytest.mark.parametrize(

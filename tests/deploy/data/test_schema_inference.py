@@ -90,6 +90,10 @@ def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
         assert main(["robot", "new", str(path.with_suffix(".toml")), "--from", str(path)]) == 0
         horizons.append(robot_named(str(path.with_suffix(".toml"))).horizon)
     assert horizons[1] == horizons[0] + 2
+    for state in delayed.states[3:]:  # a delay counts by the period
+        assert f"{1e3 * state.delay:.0f} ms after its input: {state.delay / delayed.period:.1f} periods" in (
+            paths[1].with_suffix(".toml").read_text()
+        )
 
 
 def test_a_delay_of_one_period_is_one_period_but_for_rounding():

@@ -531,6 +531,10 @@ def test_the_fields_of_exported_messages_are_the_coordinates(driven, plain, tmp_
     written = exported(driven, names, lambda t, position, turned, speeds: (*position, *turned, *speeds))
     places = ("--map", "v=speed", "w=turn rate", "speed=cmd v", "turn rate=cmd w")
     same(plain, imported(write_cells(tmp_path / "odom.csv", *written), *places), 1e-5)
+    names[6] += " [km/h]"  # the unit counts once, whoever names it
+    written = exported(driven, names, lambda t, position, turned, u: (*position, *turned, 3.6 * u[0], *u[1:]))
+    for unit in ((), ("--unit", "v=km/h")):
+        same(plain, imported(write_cells(tmp_path / "odom.csv", *written), *places, *unit), 1e-5)
 
 
 @pytest.mark.parametrize("flat", [True, False])
