@@ -76,12 +76,12 @@ class RecordedClient:
         Raises:
             FileExistsError: the folder has a log. Nothing is ever written over it.
             OSError: the log cannot be written.
-            TypeError: `client` is no client.
+            TypeError: `client` is no client of one robot.
             ValueError: `name` has other characters.
             MissingExtra: the extra `logs` is not installed.
         """
         if not isinstance(client, FilterClient):
-            raise TypeError(f"a client is needed here, not a {type(client).__name__}: give InProcess(filter)")
+            raise TypeError(f"one robot's client is needed here, not a {type(client).__name__}: give InProcess(filter)")
         if not NAME.fullmatch(name):
             raise ValueError(f"the name {name!r:.200}: use up to 100 letters, digits, dots, dashes and underscores")
         self.client, self.path = client, Path(folder) / LOG
