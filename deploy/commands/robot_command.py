@@ -137,6 +137,8 @@ def _input_text(one: dict[str, Any]) -> str:
 
 def _label(name: str) -> str:
     """Return a figure's name for people, with its unit in brackets: `period [s]` for `period_s`."""
+    if name == "way_to_a_stop_m":
+        return "way to a stop, without lag [m]"
     words, _, last = name.replace("_", " ").rpartition(" ")
     return f"{words} [{last}]" if last in ("s", "m") else f"{words} {last}".strip()
 

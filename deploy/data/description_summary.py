@@ -55,7 +55,11 @@ def remarks(robot: Robot) -> list[str]:
             not stands_somewhere(robot),
             "limit: no state without speed meets all limits. A plan that ends with standing leaves them.",
         ),
-        (bool(free), f"state: no coordinate follows {', '.join(free)}: half-widths are reported for rest only"),
+        (
+            bool(free),
+            f"state: no coordinate follows {', '.join(free)}: the half-width from full speed that `certify` reports is "
+            "that of a robot that does not respond to this input yet",
+        ),
     )
     return [text for holds, text in candidates if holds]
 
