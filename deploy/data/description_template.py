@@ -26,7 +26,7 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
     period = f"period = {schema.period:g} # s between decisions; {schema.why}"
     plan = (
-        (r"^horizon = .*", f"horizon = {horizon}"),
+        (r"^horizon = .*", f"horizon = {horizon} # with the delays in the log, without lags; check it"),
         (r"^brake = .*", f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it"),
     )
     replacements = (

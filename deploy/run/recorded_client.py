@@ -81,8 +81,7 @@ class RecordedClient:
             MissingExtra: the extra `logs` is not installed.
         """
         if not isinstance(client, FilterClient):
-            kind = type(client).__name__
-            raise TypeError(f"the client of one robot is needed here, not a {kind}: give InProcess(filter)")
+            raise TypeError(f"one robot's client is needed here, not a {type(client).__name__}: give InProcess(filter)")
         if not NAME.fullmatch(name):
             raise ValueError(f"the name {name!r:.200}: use up to 100 letters, digits, dots, dashes and underscores")
         self.client, self.path = client, Path(folder) / LOG

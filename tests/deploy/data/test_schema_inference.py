@@ -38,6 +38,7 @@ def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(dri
     assert main(["robot", "new", str(path), "--from", str(log)]) == 0
     text = path.read_text()
     assert "# The body cannot be inferred from the log: measure it." in text and "# error: cannot be inferred" in text
+    assert "# with the delays in the log, without lags" in text
     path.write_text(text.replace("radius = 0.2", "radius = 0.15").replace("sight = 3.0", "sight = 2.5"))
     capsys.readouterr()
     assert figures("robot", "check", path)["problems"] == []
