@@ -80,9 +80,9 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             filter: a method, or a client of a service, such as `SafetyClient`.
             penalty: reward for a correction as large as an input's range (`correction_penalty`).
             state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
-            obstacles: (env, observation, info) -> list of at least the obstacles within the robot's `sight`. All other
-                space is free. None: only a scan shows free space. Defaults to `info["obstacles"]`. In joint space there
-                are no obstacles, so it is not called.
+            obstacles: (env, observation, info) -> list of at least the obstacles within the robot's `sight`, and the
+                moving ones that may come so near before a plan ends. All other space is free. None: only a scan shows
+                free space. Defaults to `info["obstacles"]`. In joint space there are no obstacles, so it is not called.
             actions: mapping between the environment's actions and the robot's inputs. Defaults to the identity.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description; with a client, to the

@@ -55,6 +55,32 @@ def test_a_mover_that_arrives_after_the_robot_stands_stops_no_plan(ready, model)
     assert ready.decide(ask([still, at[-1]])).kind != ALLOWED  # what stands is kept off to the end
 
 
+@pytest.mark.parametrize(("ahead", "safe"), [(0.0, False), (GROUND.horizon * GROUND.period, True)])
+def test_a_fast_mover_must_be_listed_before_it_is_within_sight(ready, ahead, safe):
+    """With movers that are listed once they are within sight, as the pages said, they hit a robot that drove."""
+    hits, disc, speed = 0, 0.3, 4.0  # m, m/s
+    for seed in range(20):
+        rng, client = np.random.default_rng(seed), InProcess(ready, accept_bound=1.0)
+        robot, angle = Unicycle((0.0, 0.0, 0.0), rng), rng.uniform(-np.pi, np.pi)
+        at = rng.uniform(2.0, 4.0) * np.array([np.cos(angle), np.sin(angle)])
+        way = rng.normal([0.15, 0.0], 0.1) - at
+        velocity = speed * way / np.linalg.norm(way)
+        for _ in range(6):
+            motion = Motion(tuple(velocity), 0.0, acceleration=0.0)
+            far = float(np.linalg.norm(at - robot.state[:2])) - disc - speed * ahead
+            near = [Obstacle("cylinder", tuple(at), (disc,), motion=motion)] if far <= GROUND.sight else []
+            answer, start = client.decide(robot.measure(), [0.25, 0.0], near, known_free=True), robot.state
+            path, _ = robot.step(answer.action)
+            times = DT * np.arange(1, len(path) + 1)[:, None]
+            gap = np.linalg.norm(start[:2] + rotate(path, start[2]) - at - velocity * times, axis=1)
+            driving = np.linalg.norm(np.diff(path, axis=0, prepend=0.0), axis=1) > STANDING * DT
+            if (touching := np.flatnonzero(gap < disc + GROUND.footprint)).size:
+                hits += bool(driving[touching[0]] and answer.verified)
+                break
+            at = at + GROUND.period * velocity
+    assert (hits == 0) == safe
+
+
 def test_a_mover_that_breaks_its_bound_is_counted_and_the_robot_brakes(ready):
     before = Sighting((5.0, 0.0), (0.0, 0.0), 0.2)
     driving = {"state": (0, 0, 0, 0.25, 0), "plan": np.zeros((3, 2)), "model": ready.version}
