@@ -183,7 +183,7 @@ def test_the_table_of_other_settings_has_the_stored_figures() -> None:
         total, episodes = sum(map(sum, training)), sum(map(len, training))
         said = row[3].removesuffix(" episodes").split(" in ")
         each = said[1:] == ["each"]
-        assert said[0] == f"{total / len(stored) if each else total:.0f}" and (
+        assert said[0] == f"{total / len(stored) if each else total:,.0f}" and (
             each or said[1:] in ([], [f"{episodes:,}"])
         )
     assert tied >= set(OTHERS)
