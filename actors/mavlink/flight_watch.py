@@ -14,9 +14,8 @@ from brakeline.actors.mavlink.telemetry import IN_FLIGHT, MOTION, Array, unknown
 POLL = 0.005  # s between two reads of the link
 STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
 SILENT = 3.0  # s without a heartbeat after which the mode counts as unknown
-COAST = (
-    2.0  # s, for which a vehicle may fly on at its last velocity: until its autopilot's timeout, and while it brakes
-)
+# s, for which a vehicle may fly on at its last velocity: until its autopilot's timeout, and while it brakes
+COAST = 2.0
 DRIFT = 0.1  # m/s, of a vehicle that hovers
 MOST_REQUESTS = 10  # for the autopilot's clock, to which a reply still counts
 

@@ -68,7 +68,7 @@ class RosInputs:
                 self._bad_odometry = f"the odometry is in frame {frame!r}, not in {self.frame!r} (see --odometry-frame)"
             return
         with self._lock:
-            if not self._stands_upright(tilt_of(pose.orientation)):
+            if not self._accept_lean(tilt_of(pose.orientation)):
                 return
             self._base = headline(message.child_frame_id, LONGEST_FRAME) or self._base
             self._odometry.add(
@@ -86,17 +86,15 @@ class RosInputs:
             if pose is None:
                 continue
             with self._lock:
-                if self._stands_upright(pose.tilt):
+                if self._accept_lean(pose.tilt):
                     self._odometry.add_pose(seconds(stamped.header.stamp), pose.x, pose.y, pose.yaw)
 
-    def _stands_upright(self, tilt: float) -> bool:
-        """Return whether a body that leans by an angle [rad] drives in the plane. If not, its odometry is missing."""
-        upright, most = not tilt > MOST_LEAN, math.degrees(MOST_LEAN)  # what holds NaN is dropped later
-        lean = (
-            f"the robot leans by {math.degrees(tilt):.0f}° against {self.frame!r}: it may lean by at most {most:.0f}°"
-        )
-        self._bad_odometry = "" if upright else lean
-        return upright
+    def _accept_lean(self, tilt: float) -> bool:
+        """Return whether the odometry of a body that leans by an angle [rad] counts; note why, if not."""
+        leans, angle, most = tilt > MOST_LEAN, math.degrees(tilt), math.degrees(MOST_LEAN)  # NaN is dropped later
+        why = f"the robot leans by {angle:.0f}° against {self.frame!r}: it may lean by at most {most:.0f}°"
+        self._bad_odometry = why if leans else ""
+        return not leans
 
     def on_fixed_transforms(self, message: TFMessage) -> None:
         with self._lock:

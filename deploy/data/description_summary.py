@@ -44,10 +44,8 @@ def stands_somewhere(robot: Robot) -> bool:
 
 def remarks(robot: Robot) -> list[str]:
     """Return remarks on settings that are valid but probably not intended."""
-    distance, no_standing = (
-        nominal_stopping_distance(robot) or 0.0,
-        robot.horizon == robot.free_steps + robot.brake_steps,
-    )
+    distance = nominal_stopping_distance(robot) or 0.0
+    no_standing = robot.horizon == robot.free_steps + robot.brake_steps
     free = [label for label, index in zip(robot.action, robot.follows, strict=True) if index < 0]
     candidates = (
         (

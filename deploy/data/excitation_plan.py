@@ -67,9 +67,8 @@ class RegionExcitation:
         """
         self._robot, self._bounded = robot, _BoundedExcitation(robot, keep, rng)
         top = np.abs(self._bounded.motion[:2]) @ np.maximum(np.abs(robot.low()), robot.high())
-        to_stop = (nominal_stopping_distance(robot) or 0.0) + float(
-            np.linalg.norm(top)
-        ) * robot.period  # one period of delay
+        delayed = float(np.linalg.norm(top)) * robot.period  # way in one period of delay
+        to_stop = (nominal_stopping_distance(robot) or 0.0) + delayed
         self._low, self._high = self._bounded.low + to_stop, self._bounded.high - to_stop
         if not (self._low < self._high).all():
             raise BadData(f"the region {keep} is too small to stop in: a stop takes about {to_stop:.2f} m on each side")

@@ -13,8 +13,8 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.model.model_set import extra_coordinates
 
 DRIVES_ALREADY = (
-    "the robot drives already, and the request names the input of a robot that stands, without a predicted set, as the "
-    "first request does, and one after a period without a decision: nothing is known of the true input"
+    "the robot drives already, but the request names the input of a robot that stands, and has no predicted set (as a "
+    "first request, or one after a period without a decision): the true input is not known"
 )
 
 
