@@ -19,7 +19,7 @@ from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
-from brakeline.safety.filter.scan_pose import check_scan
+from brakeline.safety.filter.scan_checks import check_scan
 from brakeline.safety.filter.widening import PastWindow
 
 FLOAT = np.dtype(float)

@@ -116,7 +116,7 @@ def test_no_way_out_is_known_where_a_scan_shows_nothing(ready, monkeypatch, rang
 
     A request refuses a pose so far away, but not that of a robot whose largest speed is not known.
     """
-    monkeypatch.setattr("brakeline.safety.filter.scan_pose._largest_rate", lambda *_: math.inf)
+    monkeypatch.setattr("brakeline.safety.filter.scan_checks._largest_rate", lambda *_: math.inf)
     scan = Scan(np.full(len(FAN), ranges), FAN, pose=(0.0, 0.0, 0.0), age=0.2)
     for distance in (0.01, 0.3, 0.75, 1.25, 2.5, 3.0, 3.51, 5.0, 40.0):
         for i, angle in enumerate(np.radians(np.arange(0, 360, 40))):
