@@ -63,6 +63,6 @@ def _largest_rate(robot: Robot, state: Array, unit: str) -> float:
 def _far(away: str, most: str) -> str:
     """Return why a measurement is refused, and what to do."""
     return (
-        f"its pose is {away} from the state, and in {MAX_SCAN_AGE:g} s the robot comes {most} far at most: give both "
+        f"its pose is {away} from the state, but in {MAX_SCAN_AGE:g} s the robot can move by {most} at most: give both "
         "in one frame (m, rad), and call `memory.reset()` after you move the robot"
     )
