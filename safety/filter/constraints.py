@@ -298,8 +298,11 @@ class TubeConstraints:
     def _let_pass(self, levels: Array) -> None:
         """Drop the half-spaces (n, N) of moving obstacles for periods in which the robot stands (passive safety, §8).
 
-        A NaN stays NaN.
+        Widened sets belong to a robot that does not move as recorded. It may stand later, so they drop nothing. A NaN
+        stays NaN.
         """
+        if self.widening > 1.0:
+            return
         late = levels[:, self.stands :]
         late[late == late] = FARTHEST  # not of NaN
 

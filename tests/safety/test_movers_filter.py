@@ -55,6 +55,15 @@ def test_a_mover_that_arrives_after_the_robot_stands_stops_no_plan(ready, model)
     assert ready.decide(ask([still, at[-1]])).kind != ALLOWED  # what stands is kept off to the end
 
 
+def test_a_changed_robot_may_stand_later_so_movers_count_in_every_period_of_its_plans(ready, model):
+    """A robot with twice the lag touched walkers under verified plans, while its sets were widened."""
+    never = Filter(replace(model, stands=0))
+    at = [walker(0.9 + far, velocity=(-1.0, 0.0)) for far in np.arange(0.0, 0.6, 0.02)]
+    for widening, same_rows in ((1.0, False), (1.1, True)):
+        allowed = [[f.decide(ask([one], widening=widening)).kind == ALLOWED for one in at] for f in (ready, never)]
+        assert 0 < sum(allowed[1]) < len(at) and (allowed[0] == allowed[1]) is same_rows
+
+
 @pytest.mark.parametrize(("ahead", "safe"), [(0.0, False), (GROUND.horizon * GROUND.period, True)])
 def test_a_fast_mover_must_be_listed_before_it_is_within_sight(ready, ahead, safe):
     """With movers that are listed once they are within sight, as the pages said, they hit a robot that drove."""
