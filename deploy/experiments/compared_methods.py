@@ -95,8 +95,7 @@ METHODS: dict[str, ComparedMethod] = {
     "sac-ddpc": ComparedMethod(
         *("SAC, our filter", DDPC, MAP, "sets from recorded driving", "Haarnoja et al. 2018; Stable-Baselines3"),
         learner=SAC_LEARNER,
-        td3={"actor_rate": 3e-3},  # of an earlier tuning, without the filter
-        tuned_on={"quadrotor": {"actor_rate": 3e-4}},  # of the tuning of SAC without the filter
+        td3={"actor_rate": 3e-4},  # of the tuning of SAC without the filter
         tuned="learning rate",
         robots=BATCHES,
     ),

@@ -365,7 +365,7 @@ def test_a_setting_that_an_option_gives_stays_also_with_its_default_value(monkey
     said = []
     monkeypatch.setattr(compare_command, "say", lambda *words: said.append(words))
     for robot, method, name, option, value in (
-        ("ground", "sac-ddpc", "actor_rate", "--td3.actor-rate=0.0003", 3e-4),
+        ("ground", "sac-ddpc", "actor_rate", "--td3.actor-rate=0.003", 3e-3),
         ("quadrotor", "ddpc", "penalty_growth", "--td3.penalty-growth 1", 1.0),
         ("quadrotor", "ddpc", "batch", "--td3.batch 128", 128),
         ("quadrotor", "lagrange", "multiplier_rate", "--td3.multiplier-rate 1", 1.0),
