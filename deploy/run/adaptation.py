@@ -21,7 +21,7 @@ from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.widening import RESERVE
+from brakeline.safety.filter.widening import CHANGED, RESERVE
 from brakeline.safety.model.calibration_samples import FOLDS
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
@@ -31,8 +31,7 @@ from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, re
 from brakeline.safety.model.validation import ValidationReport, most_violations
 from brakeline.safety.model.windows import FREE, PLAN, recorded_domain, windows
 
-# A robot has changed if 100 requests without a break were widened by more than 1.3, until the stated sets hold again.
-WIDENING, REQUESTS = 1.3, 100
+REQUESTS = 100  # in so many requests without a break, a changed robot asked for a widening above `CHANGED`
 FEWEST_MINUTES = 4.0  # of driving after the change
 AGAIN = 15.0  # minutes of driving after which a model set may be replaced without a change
 MEMORY = 20.0  # minutes of driving, of all robots of the kind together
@@ -174,7 +173,7 @@ class Adaptation:
         elif decision.model != state.version:
             state.version, state.since = decision.model, now
         state.widening, state.arrived = (request.widening if 1.0 <= request.widening < math.inf else 1.0), arrived
-        if state.widening > (RESERVE if state.changed else WIDENING):
+        if state.widening > (RESERVE if state.changed else CHANGED):
             state.widened, state.requests = state.widened or now, state.requests + 1
         else:
             state.widened, state.requests = None, 0

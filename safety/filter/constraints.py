@@ -24,6 +24,7 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.reservation import ReservationRows, reservation_half_spaces
 from brakeline.safety.filter.state_limits import StateLimits, stack_rows
 from brakeline.safety.filter.tube_extent import stays, widest_extent
+from brakeline.safety.filter.widening import CHANGED
 from brakeline.safety.model.model_config import DIRECT
 from brakeline.safety.model.model_set import ModelSet, deciding_coordinates, extra_coordinates
 from brakeline.safety.perception import occluded_regions as shades
@@ -284,24 +285,23 @@ class TubeConstraints:
                 beside.append(
                     swept_half_spaces(local_map.moving, start, ends, disc.radius, measured, self.robot.period)
                 )
-                self._let_pass(beside[-1][1])
+                self._let_pass(beside[-1][1], local_map)
             if local_map.unseen is not None:
                 of = shades if isinstance(local_map.unseen, shades.OccludedRegions) else seen
                 beside.append(of.half_spaces(local_map.unseen, start, ends, disc.radius, measured, self.robot.period))
                 if isinstance(local_map.unseen, seen.OccupiedCells) and local_map.unseen.speed > 0.0:
-                    self._let_pass(beside[-1][1])
+                    self._let_pass(beside[-1][1], local_map)
             normals, offsets = beside[0] if len(beside) == 1 else map(np.concatenate, zip(*beside, strict=True))
             turned = normals if self.robot.heading is None else normals @ local_map.turn
             planes.append(Planes(start, ends, normals, turned, offsets, disc.radius, measured))
         return planes
 
-    def _let_pass(self, levels: Array) -> None:
+    def _let_pass(self, levels: Array, local_map: LocalMap) -> None:
         """Drop the half-spaces (n, N) of moving obstacles for periods in which the robot stands (passive safety, §8).
 
-        Widened sets belong to a robot that does not move as recorded. It may stand later, so they drop nothing. A NaN
-        stays NaN.
+        A robot that has changed may stand later, so none is dropped. A NaN stays NaN.
         """
-        if self.widening > 1.0:
+        if local_map.asked_widening > CHANGED:
             return
         late = levels[:, self.stands :]
         late[late == late] = FARTHEST  # not of NaN

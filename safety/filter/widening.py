@@ -23,6 +23,7 @@ WINDOWS = 600  # last windows whose scores count
 PLANS = 200  # last windows that do not overlap, of which it is known how many left their sets
 ROUNDING = 1e-9  # of a share times `WINDOWS`
 MOST = 1e3  # beyond it nothing is verified anyway, and a request needs a finite factor
+CHANGED = 1.3  # a robot whose sets are widened by more does not move as recorded
 RESERVE = 1.1  # factor on the largest score that counts
 MODELS = 4  # model sets whose scores a client keeps: replicas of a service may serve different versions
 

@@ -59,7 +59,7 @@ def test_a_changed_robot_may_stand_later_so_movers_count_in_every_period_of_its_
     """A robot with twice the lag touched walkers under verified plans, while its sets were widened."""
     never = Filter(replace(model, stands=0))
     at = [walker(0.9 + far, velocity=(-1.0, 0.0)) for far in np.arange(0.0, 0.6, 0.02)]
-    for widening, same_rows in ((1.0, False), (1.1, True)):
+    for widening, same_rows in ((1.0, False), (1.2, False), (1.4, True)):
         allowed = [[f.decide(ask([one], widening=widening)).kind == ALLOWED for one in at] for f in (ready, never)]
         assert 0 < sum(allowed[1]) < len(at) and (allowed[0] == allowed[1]) is same_rows
 
