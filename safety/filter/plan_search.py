@@ -196,10 +196,6 @@ class PlanSearch:
                 if exact.margin(choice, z) < 0.0:
                     return None
                 margin = exact.margin(at.rows, z)
-                if safety.turns_in_place(z):  # such a plan has its own tube, too, which may reach farther
-                    turning = safety.constraints_for(z, self.local_map.widening)
-                    if turning.margin_in(self.local_map, z) < 0.0:
-                        return None
                 return PlanCandidate(kind, safety.inputs.plan(z), z, margin, True, exact)
             at = self._around(z)
             exact, needed = at.constraints, 0.0

@@ -19,7 +19,7 @@ from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import FREE
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
-from tests.safety.asked import cylinder, request
+from tests.safety.asked import cylinder
 from tests.safety.test_closed_loop import ROOM, drive
 from tests.safety.unicycle import Unicycle
 
@@ -150,6 +150,10 @@ def test_the_predictors_in_place_hold_on_fresh_data(turner, driving):
     some = replace(fresh, trajectories=fresh.trajectories[:60])
     worse = validate(replace(turner, in_place=narrow), driving, some)
     assert worse.in_place_violations > 0.1 * worse.in_place_windows
+    # The tube of all plans verifies solvers' answers in place, so it is judged on them, too.
+    general = tuple(replace(s, kappa=0.1 * s.kappa, w=0.1 * s.w) for s in turner.steps)
+    worse = validate(replace(turner, steps=general), driving, some)
+    assert worse.in_place_violations > 0.1 * worse.in_place_windows
 
 
 def test_fresh_turns_stay_in_the_tubes_that_were_verified_for_them(turner):
@@ -201,29 +205,6 @@ def test_an_obstacle_beyond_the_reach_of_plans_counts_in_wider_tubes_of_turns(tu
     ready = Filter(wider, clearance_margin=0.01)
     answer = InProcess(ready, accept_bound=1.0).decide([0.0] * 5, [0.0, FAST], [cylinder(ready.reach + 0.15, 0.0)])
     assert ready.reach < 1.5 and answer.kind != ALLOWED
-
-
-def test_a_solvers_answer_in_place_is_verified_by_the_tube_of_turns(turner):
-    """It was verified by the tube of all plans, which says less about turns: 34 of 233 answers reached farther."""
-    wide = tuple(replace(step, w=step.w + 0.03) for step in turner.in_place.steps)
-    wider, rng, found = (
-        Filter(replace(turner, in_place=replace(turner.in_place, steps=wide))),
-        np.random.default_rng(0),
-        0,
-    )
-    for _ in range(300):
-        count, turns = rng.integers(1, 5), rng.choice([0.0, rng.uniform(-FAST, FAST)])
-        angles, away = rng.uniform(-np.pi, np.pi, count), 0.25 + rng.uniform(0.002, 0.15, count)
-        state, action = np.array([0.0, 0.0, 0.0, 0.0, turns]), rng.uniform(ROBOT.low(), ROBOT.high())
-        near = [cylinder(x, y) for x, y in zip(away * np.cos(angles), away * np.sin(angles), strict=True)]
-        asked = request(state, action, near, plan=np.zeros((ROBOT.horizon, 2)))
-        decision = wider.decide(asked)
-        z = np.concatenate([state[3:], state[3:], decision.plan[0]])
-        if decision.kind == ADJUSTED and wider.turns_in_place(z):
-            space = wider.constraints.local_map(asked, z[:4], wider.builder.reachable(state[3:]))
-            assert wider.in_place[1].margin_in(space, z) >= 0.0
-            found += 1
-    assert found > 5
 
 
 def test_a_robot_that_never_turns_in_place_has_no_predictors_in_place():
