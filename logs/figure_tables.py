@@ -170,7 +170,8 @@ def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
         yield "recovering", share(figures["recovering"], steps)
     if figures["broken"]:
         yield "obstacles outside their bounds", str(figures["broken"])
-    yield "outside the measurement bound", share(figures["outside"], steps)
+    beyond = ": larger errors than the description states, as in a collision" if figures["outside"] else ""
+    yield "outside the measurement bound", share(figures["outside"], steps) + beyond
     yield from _safety_rows(figures)
     for robot, learner in figures.get("learners", {}).items():
         yield f"learner {robot}", LEARNER.format(**learner)
