@@ -243,7 +243,8 @@ class ActorStats:
 
     steps: int = 0
     fallbacks: int = 0
-    waits: int = 0
+    waits: int = 0  # queries without an answer while robots stood
+    waited_s: float = 0.0  # duration of these, with the time before the next query; sum over the groups
     round_trip_ms: float = 0.0  # sum over the steps
     collisions: int = 0
     contacts_robots: int = 0
@@ -294,6 +295,7 @@ class ActorGroup(RobotGroup):
             raise BusError(f"the safety service refuses every query about these robots: {refusals.pop()}")
         if waits:
             stats.waits += 1
+            stats.waited_s += RETRY_INTERVAL + 1e-3 * max(outcome.round_trip_ms for outcome in outcomes if outcome)
             time.sleep(RETRY_INTERVAL)
             return
         turns = zip(self.actors, outcomes, strict=True)

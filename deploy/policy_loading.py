@@ -39,7 +39,7 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
     """
     policies = robot.task.policies
     if name in policies:
-        return scripted(name, robot, np.random.default_rng(seed))
+        return scripted_with_copies(name, robot, np.random.default_rng(seed))
     if is_own_code(name):
         return _own_policy(name, robot, np.random.default_rng(seed))
     if name.endswith(".csv"):
@@ -64,8 +64,10 @@ def _own_policy(place: str, robot: RobotWithTask, generator: np.random.Generator
     if not callable(policy):
         raise UnknownTask(f"an object of {place} cannot be called with (observation, info): define __call__")
 
+    given_copies = _with_copies(policy)
+
     def checked(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
-        action = np.asarray(policy(copied(observation), copied(info)), dtype=float)  # the next request is about those
+        action = np.asarray(given_copies(observation, info), dtype=float)
         if action.shape != (robot.action_dim,):
             inputs = ", ".join(robot.action)
             raise BadInput(
@@ -74,6 +76,23 @@ def _own_policy(place: str, robot: RobotWithTask, generator: np.random.Generator
         return action
 
     return checked
+
+
+def scripted_with_copies(name: str, robot: RobotWithTask, generator: np.random.Generator) -> Policy:
+    """Return the policy that the robot's task names. If it is code of your own, it gets copies. Errors: `scripted`."""
+    policy = scripted(name, robot, generator)
+    return policy if type(policy).__module__.startswith("brakeline.") else _with_copies(policy)
+
+
+def _with_copies(policy: Policy) -> Policy:
+    """Return a policy that may overwrite what it gets: the next request is about the originals."""
+
+    def given_copies(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
+        return policy(copied(observation), copied(info))
+
+    if hasattr(policy, "prepare"):  # a flight prepares such a policy for its goals
+        given_copies.prepare = policy.prepare  # type: ignore[attr-defined]
+    return given_copies
 
 
 def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:

@@ -170,10 +170,23 @@ def _summary(figures: Figures) -> Iterator[tuple[str | Text, str]]:
         yield "recovering", share(figures["recovering"], steps)
     if figures["broken"]:
         yield "obstacles outside their bounds", str(figures["broken"])
-    yield "outside the measurement bound", share(figures["outside"], steps)
+    beyond = ": larger errors than the description states, as in a collision" if figures["outside"] else ""
+    yield "outside the measurement bound", share(figures["outside"], steps) + beyond
+    yield from _waits(figures)
     yield from _safety_rows(figures)
     for robot, learner in figures.get("learners", {}).items():
         yield f"learner {robot}", LEARNER.format(**learner)
+
+
+def _waits(figures: Figures) -> Iterator[tuple[str, str]]:
+    """Yield how long robots stood without an answer since the last start of their process. Such periods are no steps.
+
+    Older logs lack the time.
+    """
+    waiting = [p["figures"] for p in figures.get("processes", {}).values() if p["figures"].get("waits")]
+    if waiting:
+        queries, seconds = (sum(one.get(name, 0.0) for one in waiting) for name in ("waits", "waited_s"))
+        yield "standing without an answer", (f"{seconds:.1f} s, " if seconds else "") + f"{queries:.0f} queries"
 
 
 def for_clearance(figures: Figures) -> str:

@@ -41,9 +41,13 @@ class AutopilotLimit:
     unit: float  # the parameter's unit in the unit of the demand
     top: float  # the largest value that the parameter takes, in its own unit
 
+    def needed(self, demands: dict[str, float]) -> float:
+        """Return the smallest sufficient value in the parameter's own unit. The parameter may not take it (`top`)."""
+        return math.ceil(10.0 * demands[self.demand] / self.unit) / 10.0
+
     def sufficient(self, demands: dict[str, float]) -> float:
         """Return the smallest sufficient value in the parameter's own unit, or `top` if that is smaller."""
-        return min(math.ceil(10.0 * demands[self.demand] / self.unit) / 10.0, self.top)
+        return min(self.needed(demands), self.top)
 
 
 AUTOPILOT_LIMITS: dict[str, tuple[AutopilotLimit, ...]] = {
@@ -73,3 +77,13 @@ def limits_below_demand(kind: str, values: dict[str, float], robot: Robot) -> li
     limits = [limit for limit in AUTOPILOT_LIMITS[kind] if limit.parameter in values]
     rows = [(limit, values[limit.parameter], limit.sufficient(demands)) for limit in limits]
     return [(limit, value, needed) for limit, value, needed in rows if value < needed - 1e-6]
+
+
+def limits_beyond_top(kind: str, values: dict[str, float], robot: Robot) -> list[tuple[AutopilotLimit, float]]:
+    """Return the limits that no value of their parameter lifts, each with the value that would suffice.
+
+    kind, values: see `limits_below_demand`.
+    """
+    demands = demand(robot)
+    needs = [(limit, limit.needed(demands)) for limit in AUTOPILOT_LIMITS[kind] if limit.parameter in values]
+    return [(limit, needed) for limit, needed in needs if needed > limit.top]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from brakeline.actors.mavlink.telemetry import Array
 from brakeline.errors import MavlinkError
@@ -27,6 +27,7 @@ class PeriodicVehicle:
     def __init__(self, robot: Robot) -> None:
         self._robot, self._changed = robot, threading.Condition()
         self._current: ControlPeriod | None = None
+        self._last_lost: ControlPeriod | None = None
         self.failure: Exception | None = None  # after which nobody flies the vehicle any more
 
     @property
@@ -41,7 +42,7 @@ class PeriodicVehicle:
         return self.failure is not None
 
     def wait(self, number: int) -> ControlPeriod:
-        """Wait until period `number` has begun, and return the current period.
+        """Wait until period `number` has begun, and return the current period. It is lost if one since `number` was.
 
         Raises:
             MavlinkError: the period does not begin in time, or nobody flies the vehicle any more.
@@ -51,7 +52,8 @@ class PeriodicVehicle:
             if not self._changed.wait_for(lambda: self.failed or self.current_period.number >= number, patience):
                 raise MavlinkError(f"period {number} does not begin")
             self.check()
-            return self.current_period
+            period, lost = self.current_period, self._last_lost
+            return period if lost is None or lost.number < number else replace(period, lost=lost.lost)
 
     def check(self) -> None:
         """Raise the error after which nobody flies the vehicle any more, if there is one."""
@@ -61,6 +63,7 @@ class PeriodicVehicle:
     def _begin(self, period: ControlPeriod) -> None:
         with self._changed:
             self._current = period
+            self._last_lost = period if period.lost else self._last_lost
             self._changed.notify_all()
 
     def _fail(self, error: Exception) -> None:

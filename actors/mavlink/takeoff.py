@@ -12,7 +12,7 @@ import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, Wait, message_id
-from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, limits_below_demand
+from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, limits_below_demand, limits_beyond_top
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, Array, unknown_quantities
 from brakeline.errors import MavlinkError, TelemetryMissing
 from brakeline.messaging.robot import Robot
@@ -150,6 +150,11 @@ class Takeoff:
                     f"{limit.parameter} is {value:g} ({limit.what}), and the filter may need {needed:g}: raise it "
                     "(--raise-limits), or the vehicle cannot follow the filter's plans"
                 )
+        for limit, needed in limits_beyond_top(kind, values, self._robot):
+            self.note(
+                f"{limit.parameter} takes at most {limit.top:g} ({limit.what}), and the filter may need {needed:g}: "
+                "lower the slew or the bounds in the description, or the vehicle follows the hardest stops late"
+            )
         if self._flight.lead:
             return
         name = TIMEOUTS[kind]

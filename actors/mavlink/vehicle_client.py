@@ -109,6 +109,7 @@ class VehicleClient(PeriodicVehicle):
     def _connect(self, request: FlightRequest, stop: Callable[[], bool]) -> None:
         """Connect to the vehicle's server, start one if there is none, and send the flight request."""
         self._current: ControlPeriod | None = None
+        self._last_lost: ControlPeriod | None = None  # another server counts its periods anew
         self.failure: Exception | None = None
         self.figures: dict[str, float] = {}  # for Health: lateness, and the ground truth of a simulated flight
         self._replies: SimpleQueue[pb.CommitReply | None] = SimpleQueue()

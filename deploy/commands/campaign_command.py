@@ -84,7 +84,7 @@ class CampaignCommand:
         """Drive the episodes of a robot, add them to its table, and return their figures."""
         from brakeline.deploy.experiments import campaign
         from brakeline.deploy.experiments.campaign import CampaignPart, cells_of, log_path, parts_of_cell, search_of
-        from brakeline.deploy.experiments.experiment_jobs import complete
+        from brakeline.deploy.experiments.experiment_jobs import check_writable, complete
         from brakeline.messaging.atomic_files import write_atomically
         from brakeline.messaging.task import address, robot_with_task, studied_arenas
 
@@ -101,6 +101,7 @@ class CampaignCommand:
         cells = [self._prepared(robot, cell) for cell in cells]
         own = robot.task.name  # additional tasks of a robot have tables of their own
         path = self.results / f"{own}.json"
+        check_writable(self.results)  # before the first of hours of episodes
         campaign.check_addable(campaign.table_of(path), cells, path, bool(self.search))
         parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
         results = complete(parts, self.runs, self.runs, self.engine, self.again, say)

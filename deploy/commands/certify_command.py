@@ -184,6 +184,7 @@ class CertifyCommand:
 
     def _print(self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], data: Dataset) -> None:
         from brakeline.deploy.data.coverage import recording_advice
+        from brakeline.deploy.data.description_summary import unmeasured_holds
 
         console.print(validation_table([(report, model.model_config.windows) for model, report in models]))
         for _, report in models:
@@ -193,6 +194,7 @@ class CertifyCommand:
         lines += dict.fromkeys((*notes, *filter(None, (widening(report) for _, report in models))))
         lines += dict.fromkeys(filter(None, (unrecorded(model) for model, _ in models)))
         lines += [f"missing: {text}" for text in recording_advice(models[0][1], data)] if models else []
+        lines += filter(None, [unmeasured_holds(data.robot)])
         for line in lines:
             console.print(line, markup=False)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import HOLD, RAMP, Array, Robot
 
 INFEASIBLE = 2  # scipy's status of a linear program without a solution
@@ -42,6 +43,18 @@ def stands_somewhere(robot: Robot) -> bool:
     return int(solution.status) != INFEASIBLE
 
 
+def unmeasured_holds(robot: Robot) -> str:
+    """Say which inputs a stop holds although no coordinate measures them. Empty if there are none."""
+    inputs = zip(robot.action, robot.follows, robot.stop, strict=True)
+    held = [split_label(label)[0] for label, follower, rule in inputs if rule == HOLD and follower < 0]
+    if names := ", ".join(held):
+        return (
+            f'no state measures {names}, which a stop holds (stop = "hold"): the filter may verify nothing near an '
+            'obstacle, not even driving away. Log it, or write stop = "ramp"'
+        )
+    return ""
+
+
 def remarks(robot: Robot) -> list[str]:
     """Return remarks on settings that are valid but probably not intended."""
     distance = nominal_stopping_distance(robot) or 0.0
@@ -66,6 +79,7 @@ def remarks(robot: Robot) -> list[str]:
             f"state: no coordinate follows {', '.join(free)}: the half-width from full speed that `certify` reports is "
             "that of a robot that does not respond to this input yet",
         ),
+        (bool(unmeasured_holds(robot)), f"input: {unmeasured_holds(robot)}"),
     )
     return [text for holds, text in candidates if holds]
 

@@ -21,7 +21,7 @@ from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_ba
 from brakeline.deploy.experiments.episode_table import COLUMNS, Column, EpisodeTable
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process, model_of
 from brakeline.deploy.experiments.trials import TrialLog, take_step
-from brakeline.deploy.policy_loading import driving, network_named
+from brakeline.deploy.policy_loading import driving, network_named, scripted_with_copies
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoBatch
 from brakeline.logs.episode_stats import closest_of
@@ -32,7 +32,7 @@ from brakeline.messaging.topics import EPISODE
 from brakeline.safety.methods import Model
 from brakeline.sim.batch.batch_support import check_batch
 from brakeline.sim.navigation_env import NavigationEnv
-from brakeline.sim.scripted_policies import Policy, scripted
+from brakeline.sim.scripted_policies import Policy
 
 ACTOR = "campaign"
 Row = dict[str, float]
@@ -105,7 +105,7 @@ class CampaignDriver:
         """Return the policy of an episode. A scripted one draws from the episode's own seed."""
         name = self.evaluation.policy
         if name in self.robot.task.policies:
-            return scripted(name, self.robot, np.random.default_rng((self.evaluation.seed, number)))
+            return scripted_with_copies(name, self.robot, np.random.default_rng((self.evaluation.seed, number)))
         return driving(network_named(name, self.robot, self.evaluation.seed))
 
     def log(self, path: Path, **about: str) -> TrialLog:

@@ -227,8 +227,8 @@ def written(name: str, value: Any) -> str:
         return "–"
     factor, unit = (100.0, " %") if name in PERCENT else (1.0, "")
     digits = ".2f" if name in RARE else ".1f" if name in PERCENT else DIGITS.get(name, ".0f")
-    if isinstance(value, MeanEstimate) and name in OF_SEEDS and len(value.seeds) == 1:
-        value = value.value  # one number has no interval
+    if isinstance(value, MeanEstimate) and name in OF_SEEDS and value.low == value.high:
+        value = value.value  # one seed has no interval, and where no seed got there, each counts alike
     if isinstance(value, MeanEstimate):
         middle, low, high = (f"{factor * v:{digits}}" for v in (value.value, value.low, value.high))
         return f"{middle}{unit} [{low}, {high}]"

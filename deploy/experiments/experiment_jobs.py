@@ -103,7 +103,7 @@ def _default(field: Field[Any]) -> Any:
     return json.loads(json.dumps(plain))
 
 
-def _check_writable(folder: Path) -> None:
+def check_writable(folder: Path) -> None:
     """Raise OSError if the folder cannot hold results, before a job runs for hours."""
     folder.mkdir(parents=True, exist_ok=True)
     TemporaryFile(dir=folder).close()
@@ -155,7 +155,7 @@ def complete(
         raise ResultError(f"{twice[0]} would hold two results: give each setting once, and files different names")
     missing = [job for job in jobs if again or read(results, job) is None]
     for folder in {result_path(results, job).parent for job in missing}:
-        _check_writable(folder)
+        check_writable(folder)
     with only_study(robot_folder(runs, job.robot) for job in missing):
         if again:
             for job in jobs:

@@ -228,7 +228,7 @@ def _main(robot_results: RobotResults) -> list[str]:
         shares = [_percent(robot_results.interventions(method, arena)) for arena in robot_results.arenas]
         times = [f"{robot_results.decision_ms(method, arena):.2f}" for arena in robot_results.arenas]
         figures = aggregate(learned)
-        speed = f"{figures['iqm']:,.0f}" + _interval(figures["iqm_interval"], ",.0f")
+        speed = f"{figures['iqm']:,.0f}" + (_interval(figures["iqm_interval"], ",.0f") if reached else "")
         rows.append([compared(method).label, speed, f"{reached} of {len(cells)}", *shares, *times])
     return [*lines, *markdown_table(heads, rows), ""]
 

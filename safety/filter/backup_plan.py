@@ -179,13 +179,16 @@ class BackupPlan:
 
     @property
     def still_verified(self) -> bool:
-        """Whether the plan is verified and the measured state is in its predicted set; without one, in its tube."""
+        """Whether the plan is verified and the measured state is in its predicted set; without one, in its tube.
+
+        In joint space a tube has no boxes: nothing shows that the robot still follows a plan without a predicted set.
+        """
         if self.model == UNVERIFIED or not self._compare:
             return self.model != UNVERIFIED
         if self.predicted is not None:
             return self.predicted.contains(self.robot, self.seen)
         if self._tube is None or not self._tube[0].size:  # none is left: the plan has ended
-            return True
+            return bool(self.robot.position_dim)  # in joint space, there are no boxes to compare with
         center, half_width = (part[0] for part in self._tube)
         return bool((np.abs(self.seen[: len(center)] - center) <= half_width + SAME_SET).all())
 

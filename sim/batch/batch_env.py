@@ -322,7 +322,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
 def _own(values: Any) -> Any:
     """Return a copy of an array, or of the arrays of infos: a policy may overwrite what it gets."""
     if isinstance(values, dict):
-        return {name: _own(part) if isinstance(part, np.ndarray) else part for name, part in values.items()}
+        return {name: _own(part) if isinstance(part, np.ndarray | dict) else part for name, part in values.items()}
     return values.copy()
 
 

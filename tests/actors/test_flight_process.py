@@ -13,7 +13,7 @@ import pytest
 from brakeline.actors.actor_process import ActorSettings
 from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.flight_process import BackgroundPublisher, FlightRunner, RealTimeVehicle
-from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod, PeriodicVehicle
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.free_ports import free_endpoint
@@ -79,3 +79,16 @@ def test_a_plan_whose_input_the_vehicle_does_not_execute_is_not_verified(number:
     flown.wait = lambda _: ControlPeriod(number + 1, rows[number - 4], STANDING)
     vehicle.step(rows[number - 3])
     assert plan.model == UNVERIFIED and plan.next_input == pytest.approx(rows[number - 4])
+
+
+@pytest.mark.parametrize(("lost", "counts"), [(4, False), (5, True), (6, True), (7, True)])
+def test_a_step_is_lost_if_a_period_that_it_skipped_was(lost: int, counts: bool) -> None:
+    """The environment observed period 4, and then period 7. The state of period 4 counted for the step before."""
+    flown, plan = PeriodicVehicle(QUADROTOR.in_real_time()), BackupPlan(QUADROTOR.in_real_time())
+    flown._begin(ControlPeriod(4, np.zeros(3), STANDING, HELD if lost == 4 else ""))
+    vehicle: Any = RealTimeVehicle(flown, plan.fallback, plan.executes, acceleration_age=0.0)  # type: ignore[arg-type]
+    for number in (5, 6, 7):
+        flown._begin(ControlPeriod(number, np.zeros(3), STANDING, HELD if lost == number else ""))
+    vehicle.step(np.zeros(3))
+    assert vehicle.current_period.number == 7 and vehicle.skipped == 2
+    assert vehicle.current_period.lost == (HELD if counts else "")

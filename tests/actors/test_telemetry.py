@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, message_id
-from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
+from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand, limits_beyond_top
 from brakeline.actors.mavlink.position_lookahead import LATENCY, PARAMETERS, AxisLookahead, PositionLookahead
 from brakeline.actors.mavlink.takeoff import Takeoff
 from brakeline.actors.mavlink.telemetry import (
@@ -240,6 +240,11 @@ def test_parameters_below_the_robots_bounds_are_found() -> None:
     demands = demand(QUADROTOR)
     assert (demands["speed"], demands["climb"], demands["acceleration"]) == pytest.approx((50**0.5, 5.0, 32**0.5))
     assert below[0][2] == 500.0, "the largest value that the parameter takes"
+    raised = known | {"WPNAV_ACCEL": 500.0}
+    assert limits_below_demand("ardupilot", raised, QUADROTOR) == []
+    beyond = limits_beyond_top("ardupilot", raised, QUADROTOR)
+    assert [(limit.parameter, needed) for limit, needed in beyond] == [("WPNAV_ACCEL", 565.7)]
+    assert limits_beyond_top("px4", {"MPC_XY_VEL_MAX": 12.0, "MPC_TILTMAX_AIR": 45.0}, QUADROTOR) == []
 
 
 def test_missing_quantities_of_the_estimator_have_names() -> None:

@@ -8,6 +8,7 @@ import re
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
 import numpy as np
@@ -18,10 +19,11 @@ from brakeline import Filter, InProcess
 from brakeline.deploy import progress
 from brakeline.deploy.cli import COMMANDS, command_class, main, reason
 from brakeline.deploy.commands import certify_command
-from brakeline.deploy.commands.certify_command import unrecorded, validation_table
+from brakeline.deploy.commands.certify_command import CertifyCommand, unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
 from brakeline.deploy.commands.query_command import OBSTACLE_FORMS, load_scan, parse_obstacle, plan_table, proposal
+from brakeline.deploy.data.description_summary import remarks, unmeasured_holds
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.errors import BadScan, Untrusted
 from brakeline.logs.figure_tables import analyse
@@ -29,6 +31,7 @@ from brakeline.logs.run_groups import METHOD_COLORS
 from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.stated_share import percent
@@ -312,6 +315,17 @@ def test_certify_says_which_inputs_were_not_recorded():
     fast = replace(ground, robot=replace(ground.robot, name="fast", action_high=(1.0, 0.5)))
     said = "the filter verifies recorded inputs alone: command speed from 0 to 0.255 m/s (26 % of its range)"
     assert unrecorded(fast) == said
+
+
+def test_an_input_that_a_stop_holds_and_nobody_measures_is_told(capsys):
+    """The filter may then verify nothing, and the robot stands there."""
+    ground = robot_named("ground")
+    held = replace(ground, stop=("ramp", "hold"), follows=(3, -1))
+    assert unmeasured_holds(ground) == unmeasured_holds(replace(held, follows=(3, 4))) == ""
+    assert any("no state measures turn rate" in remark for remark in remarks(held))
+    for robot, told in ((ground, False), (held, True)):
+        CertifyCommand()._print([], [], SimpleNamespace(robot=robot))
+        assert ("no state measures turn rate, which a stop holds" in capsys.readouterr().out) == told
 
 
 def test_only_the_innermost_of_nested_work_prints_its_progress(monkeypatch, capsys):

@@ -1,12 +1,14 @@
 """A policy by the folder of the run that trained it, and by a class in a file of your own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from brakeline.deploy.policy_loading import file_named, network_named, policy_hash, policy_named
 from brakeline.errors import BadInput, UnknownTask
 from brakeline.messaging.policy_weights import MLP
-from brakeline.messaging.task import robot_with_task
+from brakeline.messaging.task import robot_with_task, with_task
 
 GROUND = robot_with_task("ground")
 
@@ -57,6 +59,21 @@ class Silent:
 """
 
 
+TASK_AGENT = """
+class Cheat:
+    def __init__(self, robot, generator):
+        pass
+
+    def prepare(self, stage):
+        self.stage = stage
+
+    def __call__(self, observation, info):
+        info["state"][:] = 0.0
+        info["obstacles"].clear()
+        return [0.1, 0.2]
+"""
+
+
 def test_a_class_or_a_function_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
     (tmp_path / "agent.py").write_text(AGENT)
     monkeypatch.chdir(tmp_path)
@@ -77,6 +94,17 @@ def test_a_policy_of_your_own_that_overwrites_what_it_gets_changes_no_request(tm
     policy_named("agent.py:greedy", GROUND, 0)(observation, info)
     assert observation.all() and observation.max() == 1.0
     assert info["state"].all() and info["obstacles"] == ["a post"]
+
+
+def test_neither_does_a_policy_that_a_task_names(tmp_path):
+    (tmp_path / "task_agent.py").write_text(TASK_AGENT)
+    policies = {"cheat": "task_agent.py:Cheat"}
+    mine = with_task(GROUND, replace(GROUND.task, folder=tmp_path, policies=policies))
+    policy, info = policy_named("cheat", mine, 0), {"state": np.ones(5), "obstacles": ["a post"]}
+    policy(np.ones(3, np.float32), info)
+    assert info["state"].all() and info["obstacles"] == ["a post"]
+    policy.prepare("stage")
+    assert policy.prepare.__self__.stage == "stage", "a flight prepares it"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import itertools
 import math
 import random
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -128,6 +129,16 @@ def test_processes_and_learners(say: Say) -> None:
     assert (process["starts"], process["alive"], process["notes"]) == (2, False, {"model": "v2"})
     assert (learner["updates"], learner["critic_loss"]) == (9, 0.5)
     assert figures["not_finite"] == 1 and figures["seconds"] == 4.0
+
+
+def test_the_time_in_which_robots_waited_for_the_service_is_shown(say: Say) -> None:
+    """Such periods are no steps."""
+    metrics, line = Metrics(), "standing without an answer"
+    put(metrics, say("health/actor-0", pb.Health(process="actor-0", figures={"waits": 0.0, "waited_s": 0.0})))
+    assert line not in printed(show(metrics.figures()))
+    put(metrics, say("health/actor-0", pb.Health(process="actor-0", figures={"waits": 40.0, "waited_s": 6.25})))
+    put(metrics, say("health/actor-1", pb.Health(process="actor-1", figures={"waits": 2.0, "waited_s": 1.0})))
+    assert re.search(rf"{line} +7\.2 s, 42 queries", printed(show(metrics.figures())))
 
 
 def run_of_two_actors(say: Say) -> dict[str, list[Sample]]:

@@ -14,6 +14,7 @@ from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND
 from tests.safety.asked import STILL, cylinder, request
+from tests.safety.joints import joints
 from tests.safety.toys import puck
 
 ELSEWHERE = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
@@ -154,6 +155,25 @@ def test_a_robot_outside_its_tube_after_missing_replies_has_no_verified_plan(mis
         assert request.model == (client.method.version if verified else UNVERIFIED)
     answer = client.decide(state + 2.5 * np.eye(9)[0], blind, wall)
     assert (answer.kind, answer.verified, answer.contained) == (FAILSAFE, False, True)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_in_joint_space_nothing_shows_that_a_robot_follows_its_plan_after_a_missing_reply(measured):
+    """Its tube has no boxes: after a second measured state without a decision, any state counted as in the tube."""
+    backup_plan, state = BackupPlan(joints()), np.zeros(4)
+    plan = np.zeros((backup_plan.robot.horizon, 2))
+    plan[:2] = 0.5
+    boxes = np.zeros((0, 0)), np.zeros((0, 0))
+    backup_plan.accept(plan, "v1", Prediction(state, np.full(4, 0.1), 0.0), True, (b"word",) * 6, tube=boxes)
+    backup_plan.measured(state)
+    backup_plan.fallback()
+    assert backup_plan.model == "v1" and backup_plan.plan_token, "the state is in the predicted set"
+    if measured:
+        backup_plan.measured(state + 3.0)
+    assert (backup_plan.model, bool(backup_plan.plan_token)) == ((UNVERIFIED, False) if measured else ("v1", True))
+    for _ in range(2 * len(plan)):
+        backup_plan.fallback()
+    assert backup_plan.model == "", "it stands"
 
 
 def test_without_a_measured_state_nothing_is_fed_back():

@@ -127,6 +127,45 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
 
 
+def test_a_robot_that_leaves_its_tube_while_nobody_decides_has_no_verified_plan() -> None:
+    """As a single plan: the first robot keeps to its tube, and the second leaves it after a period without decision."""
+    plans, singles = BackupPlanBatch(SAFETY, 2), [InProcess(SAFETY) for _ in range(2)]
+    names, free = np.array(["", SAFETY.version, UNVERIFIED]), ObstacleArrays.of([Shapes.of([], 2)] * 2)
+    states, actions = np.zeros((2, 5)), np.tile([0.2, 0.0], (2, 1))
+    plans.decide(states, actions, free)
+    for row, single in enumerate(singles):
+        single.decide(states[row], actions[row], known_free=True)
+    plans.safety = FAILING  # type: ignore[assignment]
+    states[:] = plans.predicted.center
+    for _ in range(2):
+        plans.decide(states, actions, free)
+        for row, single in enumerate(singles):
+            single.backup_plan.measured(states[row])
+            single.fallback()
+        assert names[plans._status].tolist() == [single.backup_plan.model for single in singles]
+        states[:, :2] = plans._tube_center[:, 0]
+        states[1, 0] += 0.5
+    assert names[plans._status].tolist() == [SAFETY.version, UNVERIFIED]
+
+
+def test_a_request_after_a_lost_decision_states_whether_the_robot_is_in_its_tube() -> None:
+    plans, free = BackupPlanBatch(SAFETY, 3), ObstacleArrays.of([Shapes.of([], 2)] * 3)
+    states, actions, requested = np.zeros((3, 5)), np.tile([0.2, 0.0], (3, 1)), []
+    plans.decide(states, actions, free)
+    plans.safety = FAILING  # type: ignore[assignment]
+    states[:] = plans.predicted.center
+    states[2] = np.nan
+    plans.decide(states, actions, free)
+    plans.safety = Broken((0, 0, 0), 0.2)  # type: ignore[assignment]
+    decide = plans.safety.decide_batch
+    plans.safety.decide_batch = lambda requests: requested.append(requests.model) or decide(requests)  # type: ignore
+    states[:, :2] = plans._tube_center[:, 0]
+    states[2, 2:] = states[0, 2:]
+    states[1, 0] += 0.5
+    plans.decide(states, actions, free)
+    assert requested == [[SAFETY.version, UNVERIFIED, SAFETY.version]]
+
+
 @pytest.mark.parametrize("safety", [lambda: SAFETY, one_step], ids=["periods", "windows"])
 def test_a_proposal_that_is_not_finite_is_decided_and_scored_as_by_a_single_plan(safety: Any) -> None:
     """The robot leaves its set in the very period of that proposal, so the score of the period widens its sets."""

@@ -169,6 +169,21 @@ def test_a_masked_reset_returns_what_the_other_robots_saw_whatever_a_policy_made
     batch.close()
 
 
+def test_a_policy_that_overwrites_the_obstacles_frees_no_space() -> None:
+    batch, sound = (BatchNavigationEnv(GROUND, 2, "dense") for _ in range(2))
+    (_, infos), _ = batch.reset(seed=1), sound.reset(seed=1)
+    for _ in range(3):
+        for array in infos["obstacles"].values():
+            array[:] = 0
+        observations, *_, infos = batch.step(np.tile([0.2, 0.1], (2, 1)))
+        seen, *_, expected = sound.step(np.tile([0.2, 0.1], (2, 1)))
+        assert np.array_equal(observations, seen), "also the rays"
+        for name in ("center", "rho", "count"):
+            assert np.array_equal(infos["obstacles"][name], expected["obstacles"][name])
+    batch.close()
+    sound.close()
+
+
 def test_noise_is_that_of_each_generator() -> None:
     streams = NormalStreams(3)
     for row in range(3):

@@ -77,6 +77,8 @@ class BackupPlanBatch:
         self.predicted = PredictionArrays(
             np.zeros((size, n)), np.zeros((size, n)), np.zeros(size), np.zeros(size, dtype=bool)
         )
+        # boxes of the next positions, from the last decisions' tubes: centers and half-widths; NaN where there is none
+        self._tube_center, self._tube_half_width = np.full((2, size, N, robot.position_dim), np.nan)
         self._status, self._still = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
         self._periods = np.zeros(size, dtype=np.int64)
@@ -91,7 +93,7 @@ class BackupPlanBatch:
         zero = self.robot.zero_input()
         self.input_in_force[which], self.plan[which], self._inputs[which] = zero, zero, zero
         self._status[which], self._still[which], self._periods[which] = STANDING, self.robot.horizon, 0
-        self.predicted.given[which] = False
+        self.predicted.given[which], self._tube_center[which] = False, np.nan
         if self.independent:
             self._scores[which], self._scored[which] = 0.0, False
 
@@ -140,6 +142,7 @@ class BackupPlanBatch:
         """
         states, actions, obstacles = np.asarray(states, float), np.asarray(actions, float), mapped(obstacles, _precise)
         usable = _plausible(states)
+        self._status[usable & (self._status == VERIFIED) & self._left_tube(states)] = OPEN  # as `BackupPlan.measured`
         if observations is not None:
             usable &= np.isfinite(observations).all(axis=1)
             observations = np.where(usable[:, None], observations, np.float32(0.0))
@@ -169,6 +172,12 @@ class BackupPlanBatch:
             errors = sets.errors(np, states, self.robot.heading)
         return np.asarray(sets.given & (errors <= sets.half_width + SAME_SET).all(axis=1))
 
+    def _left_tube(self, states: Array) -> Flags:
+        """Return which rows (B,) have no predicted set, and a measured position outside the tube's next box."""
+        center, half_width = self._tube_center[:, 0], self._tube_half_width[:, 0]
+        away = np.abs(states[:, : center.shape[1]] - center)
+        return np.asarray(~self.predicted.given & (away > half_width + SAME_SET).any(axis=1))  # NaN: there is no box
+
     def _shares_used(self, states: Array) -> Array:
         """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
         with np.errstate(all="ignore"):
@@ -186,9 +195,11 @@ class BackupPlanBatch:
 
     def _follow(self, states: Array, decided: Flags, answers: DecisionArrays | None) -> Array:
         """Commit to the decided plans, keep the others, and return the inputs of the coming period (B, m)."""
-        outside = self.predicted.given & ~self.contains(states)
+        outside = self.predicted.given & _plausible(states) & ~self.contains(states)
         self._status[~decided & outside] = OPEN
         self.predicted.given[~decided] = False
+        for tube in (self._tube_center, self._tube_half_width):
+            tube[:] = np.append(tube[:, 1:], np.full_like(tube[:, :1], np.nan), axis=1)
         if answers is not None:
             self._accept(states, decided, answers)
         return self._advance(states)
@@ -209,6 +220,7 @@ class BackupPlanBatch:
         sets = self.predicted
         sets.center[rows], sets.half_width[rows] = answers.predicted_center[rows], answers.predicted_half_width[rows]
         sets.heading[rows] = answers.predicted_heading[rows]
+        self._tube_center[rows], self._tube_half_width[rows] = answers.tube_center[rows], answers.tube_half_width[rows]
         sets.given[rows] = np.isfinite(answers.predicted_center[rows]).all(axis=1)
 
     def _judge(self, rows: Flags, of_plans: Array, scores: Array) -> None:

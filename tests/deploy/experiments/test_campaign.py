@@ -293,3 +293,11 @@ def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path
 def test_a_mistyped_name_ends_it_before_it_begins(data_folder, tmp_path, change, said):
     with pytest.raises(ValueError, match=said):
         CampaignCommand(runs=tmp_path, results=tmp_path, **change).run()
+
+
+def test_results_that_cannot_be_written_end_it_before_it_begins(data_folder, tmp_path, monkeypatch):
+    """The tables come last, and the rows of the episodes have another folder."""
+    monkeypatch.setattr(CampaignPart, "run", lambda *_: pytest.fail("driven"))
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        CampaignCommand(runs=tmp_path / "runs", results=tmp_path / "file" / "results", engine=IN_THIS_PROCESS).run()

@@ -318,6 +318,7 @@ def test_the_steps_of_one_training_have_no_interval():
     """An interval without a width would claim that each other seed needs as many steps."""
     assert written("steps to 90 % goals", mean([[4000.0]])) == "4000"
     assert "[" in written("steps to 90 % goals", mean([[4000.0], [5000.0]]))
+    assert written("steps to 90 % goals", mean([[60_000.0]] * 5)) == "60000", "no seed got there"
     assert written("mean reward", mean([[4.0, 4.0]])) == "4 [4, 4]"
 
 

@@ -93,6 +93,13 @@ def test_every_figure_follows_from_the_cells(results):
     assert goals.shape == (2, 3) and np.allclose(goals[1], [0.87, 0.83, 0.7])
 
 
+def test_steps_that_no_run_needed_have_no_interval(results):
+    for path in (results / "ground").glob("*.json"):
+        if json.loads(path.read_text())["study"]["method"] == "none":
+            change(path, lambda cell: cell["training"]["episodes"].update(goal=[0] * 100))
+    assert "| TD3 | 60,000 | 0 of 3 |" in page(results, ["ground"])
+
+
 def test_cells_of_two_simulators_and_of_two_settings_of_a_rival_are_not_mixed(results):
     old = results / "ground" / "none-s0.json"
     change(old, lambda cell: cell["study"].pop("physics"))
