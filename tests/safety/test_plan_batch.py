@@ -1,6 +1,7 @@
 """Committed plans as arrays decide, widen and brake as one `BackupPlan` for each robot does."""
 
 import math
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -125,6 +126,29 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
         assert [outcome.answers.row(row).kind for row in range(2)] == [FAILSAFE, ALLOWED]
     assert np.allclose(outcome.inputs[1], actions[1]) == (broken is not FAILING)
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
+
+
+@pytest.mark.parametrize("missing", [1, 2])  # a plan has 3 periods
+def test_a_robot_outside_its_tube_after_missing_decisions_has_no_verified_plan(missing: int) -> None:
+    """As `BackupPlan`. Nothing compared its positions: wherever the robot was, its plan counted as verified."""
+    plans, single, free = BackupPlanBatch(SAFETY, 3), InProcess(SAFETY), ObstacleArrays.of([Shapes.of([], 2)] * 3)
+    state, go, asked = np.zeros(5), np.array([0.25, 0.0]), []
+    plans.decide(np.tile(state, (3, 1)), np.tile(go, (3, 1)), free)
+    answer = single.decide(state, go, known_free=True)
+    plans.safety = FAILING  # type: ignore[assignment]
+    for k in range(missing):
+        state = answer.predicted.center if k == 0 else np.append(answer.tube_center[k], np.zeros(3))
+        assert not plans.decide(np.tile(state, (3, 1)), np.tile(go, (3, 1)), free).decided.any()
+        single.request(single.backup_plan, state, go, known_free=True)
+        single.fallback()
+    plans.safety = Broken(None)  # type: ignore[assignment]
+    plans.safety.decide_batch = lambda requests: asked.append(requests) or SAFETY.decide_batch(requests)  # type: ignore
+    (center, *_), (half, *_) = answer.tube_center[missing], answer.tube_half_width[missing]
+    states = np.tile(state, (3, 1))
+    states[:, 0] = center + np.array([0.9, 1.1, np.nan]) * half
+    plans.decide(states, np.tile(go, (3, 1)), free)
+    models = [single.request(deepcopy(single.backup_plan), one, go, known_free=True).model for one in states]
+    assert asked[0].model == models == [SAFETY.version, UNVERIFIED, SAFETY.version]
 
 
 @pytest.mark.parametrize("safety", [lambda: SAFETY, one_step], ids=["periods", "windows"])

@@ -77,6 +77,8 @@ class BackupPlanBatch:
         self.predicted = PredictionArrays(
             np.zeros((size, n)), np.zeros((size, n)), np.zeros(size), np.zeros(size, dtype=bool)
         )
+        # boxes of the positions now and later, from the last decisions' tubes: centers and half-widths
+        self._tube = np.zeros((2, size, N + 1, robot.position_dim))
         self._status, self._still = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
         self._periods = np.zeros(size, dtype=np.int64)
@@ -140,6 +142,7 @@ class BackupPlanBatch:
         """
         states, actions, obstacles = np.asarray(states, float), np.asarray(actions, float), mapped(obstacles, _precise)
         usable = _plausible(states)
+        self._status[usable & ~self.predicted.given & (self._status == VERIFIED) & ~self._in_tubes(states)] = OPEN
         if observations is not None:
             usable &= np.isfinite(observations).all(axis=1)
             observations = np.where(usable[:, None], observations, np.float32(0.0))
@@ -168,6 +171,12 @@ class BackupPlanBatch:
         with np.errstate(all="ignore"):  # states may be infinite
             errors = sets.errors(np, states, self.robot.heading)
         return np.asarray(sets.given & (errors <= sets.half_width + SAME_SET).all(axis=1))
+
+    def _in_tubes(self, states: Array) -> Flags:
+        """Return whether the positions lie in the committed plans' tubes (B,): see `BackupPlan.still_verified`."""
+        (center, half_width), d = self._tube[:, :, 0], self.robot.position_dim
+        with np.errstate(all="ignore"):
+            return np.asarray((np.abs(states[:, :d] - center) <= half_width + SAME_SET).all(axis=1))
 
     def _shares_used(self, states: Array) -> Array:
         """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
@@ -205,6 +214,7 @@ class BackupPlanBatch:
             self._judge(rows & ~first & self.predicted.given, scores, scores)
         self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
+        self._tube[:, rows, 1:] = answers.tube_center[rows], answers.tube_half_width[rows]
         self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)
         sets = self.predicted
         sets.center[rows], sets.half_width[rows] = answers.predicted_center[rows], answers.predicted_half_width[rows]
@@ -222,6 +232,7 @@ class BackupPlanBatch:
         robot, now = self.robot, self.plan[:, 0].copy()
         self._states = np.concatenate([self._states[:, 1:], states[:, None]], axis=1)
         self._inputs = np.concatenate([self._inputs[:, 1:], now[:, None]], axis=1)
+        self._tube = np.concatenate([self._tube[:, :, 1:], self._tube[:, :, -1:]], axis=2)
         self._periods = np.where(_plausible(states), self._periods + 1, 0)  # a gap ends the window
         rests = robot.is_stop_input(now)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[:, -1])
