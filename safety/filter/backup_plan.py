@@ -166,7 +166,7 @@ class BackupPlan:
         self._judged = judges
         if score is None and not judges and self._compare and self.predicted is not None:  # the model set before did
             self.widening.judge_period(self.predicted.share_used(self.robot, self.seen))
-        known = not verified or self.widening.use(model)
+        known = not model or self.widening.use(model)
         if score is not None and known:
             self.widening.judge(score, outside_share, plan_score)
         self.reservation = reservation

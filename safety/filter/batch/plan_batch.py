@@ -85,7 +85,7 @@ class BackupPlanBatch:
         self._judged, self._widened = False, np.ones(size)  # factors by which the predicted sets were widened
         # scores of plans, and of all coordinates
         self._scores, self._place = np.zeros((size, 2, WINDOWS)), np.zeros(size, dtype=np.int64)
-        self._scored, self._outside_share = np.zeros(size, dtype=bool), 0.0
+        self._outside_share = 0.0
         self.reset(np.ones(size, dtype=bool))
 
     def reset(self, which: Flags) -> None:
@@ -95,7 +95,7 @@ class BackupPlanBatch:
         self._status[which], self._still[which], self._periods[which] = STANDING, self.robot.horizon, 0
         self.predicted.given[which] = False
         if self.independent:
-            self._scores[which], self._scored[which] = 0.0, False
+            self._scores[which] = 0.0
 
     @property
     def widening(self) -> Array:
@@ -205,13 +205,11 @@ class BackupPlanBatch:
     def _accept(self, states: Array, rows: Flags, answers: DecisionArrays) -> None:
         self._judged, asked = answers.judges, self.state_widening
         self._outside_share = answers.outside_share
-        first = rows & answers.verified & ~self._scored
-        self._scored |= first
-        self._judge(rows & ~first & answers.scored, answers.plan_score, answers.score)
+        self._judge(rows & answers.scored, answers.plan_score, answers.score)
         if not answers.judges:  # as `BackupPlan.accept`: the client scores the last period
             scores = self._shares_used(states) * self._widened
             scores = np.where(scores <= 1.0, 0.0, scores)
-            self._judge(rows & ~first & self.predicted.given, scores, scores)
+            self._judge(rows & self.predicted.given, scores, scores)
         self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
         self._tube[:, rows, 1:] = answers.tube_center[rows], answers.tube_half_width[rows]
