@@ -202,6 +202,13 @@ def test_an_observation_that_is_not_finite_costs_its_robot_alone_a_rivals_decisi
     assert np.isnan(observations[0, 1]), "the caller's array stays"
 
 
+@pytest.mark.parametrize("shape", [(3, 5), (2, 4), (5,), (1, 5)])
+def test_states_of_another_number_or_size_are_refused(shape: tuple[int, ...]) -> None:
+    plans, free = BackupPlanBatch(SAFETY, 2), ObstacleArrays.of([Shapes.of([], 2)] * 2)
+    with pytest.raises(BadRequest, match=r"states has shape .*: give \(2, 5\)"):
+        plans.decide(np.zeros(shape), np.zeros((2, 2)), free)
+
+
 def test_plans_of_other_robots_are_not_kept_in_batches() -> None:
     other = Broken(None)
     other.robot = robot_named("ground-late")

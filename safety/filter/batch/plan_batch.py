@@ -139,8 +139,13 @@ class BackupPlanBatch:
         The decision on a proposal that is not finite is a failsafe. Arrays in single precision are converted.
 
         observations (B, o): by which a rival decides; the filter does not need them.
+
+        Raises:
+            BadRequest: there is not one state of the robot's size for each robot.
         """
         states, actions, obstacles = np.asarray(states, float), np.asarray(actions, float), mapped(obstacles, _precise)
+        if states.shape != (sized := self.predicted.center.shape):
+            raise BadRequest("state", f"states has shape {states.shape}: give {sized}, a state for each robot")
         usable = _plausible(states)
         self._status[usable & ~self.predicted.given & (self._status == VERIFIED) & ~self._in_tubes(states)] = OPEN
         if observations is not None:
