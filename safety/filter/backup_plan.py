@@ -166,7 +166,7 @@ class BackupPlan:
         self._judged = judges
         if score is None and not judges and self._compare and self.predicted is not None:  # the model set before did
             self.widening.judge_period(self.predicted.share_used(self.robot, self.seen))
-        known = not verified or self.widening.use(model)
+        known = not model or self.widening.use(model)
         if score is not None and known:
             self.widening.judge(score, outside_share, plan_score)
         self.reservation = reservation
@@ -187,7 +187,7 @@ class BackupPlan:
             return self.model != UNVERIFIED
         if self.predicted is not None:
             return self.predicted.contains(self.robot, self.seen)
-        if self._tube is None or not self._tube[0].size:  # none is left: the plan has ended
+        if self._tube is None or not self._tube[0].size:
             return bool(self.robot.position_dim)  # in joint space, there are no boxes to compare with
         center, half_width = (part[0] for part in self._tube)
         return bool((np.abs(self.seen[: len(center)] - center) <= half_width + SAME_SET).all())
@@ -231,7 +231,8 @@ class BackupPlan:
             self.widening.interrupt()
         self._compare = False
         self._plan_tokens = self._plan_tokens[1:] or self._plan_tokens
-        self._tube = None if self._tube is None else (self._tube[0][1:], self._tube[1][1:])
+        if self._tube is not None and len(self._tube[0]) > 1:  # after the plan's end, the robot stands in the last box
+            self._tube = self._tube[0][1:], self._tube[1][1:]
         self.reservation = None if self.reservation is None else self.reservation.later()
         rests = not blind and robot.is_stopping(now, self.seen, self.input_in_force)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[-1])

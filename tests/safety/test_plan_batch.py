@@ -1,6 +1,7 @@
 """Committed plans as arrays decide, widen and brake as one `BackupPlan` for each robot does."""
 
 import math
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -143,7 +144,7 @@ def test_a_robot_that_leaves_its_tube_while_nobody_decides_has_no_verified_plan(
             single.backup_plan.measured(states[row])
             single.fallback()
         assert names[plans._status].tolist() == [single.backup_plan.model for single in singles]
-        states[:, :2] = plans._tube_center[:, 0]
+        states[:, :2] = plans._tube[0][:, 0]
         states[1, 0] += 0.5
     assert names[plans._status].tolist() == [SAFETY.version, UNVERIFIED]
 
@@ -159,11 +160,34 @@ def test_a_request_after_a_lost_decision_states_whether_the_robot_is_in_its_tube
     plans.safety = Broken((0, 0, 0), 0.2)  # type: ignore[assignment]
     decide = plans.safety.decide_batch
     plans.safety.decide_batch = lambda requests: requested.append(requests.model) or decide(requests)  # type: ignore
-    states[:, :2] = plans._tube_center[:, 0]
+    states[:, :2] = plans._tube[0][:, 0]
     states[2, 2:] = states[0, 2:]
     states[1, 0] += 0.5
     plans.decide(states, actions, free)
     assert requested == [[SAFETY.version, UNVERIFIED, SAFETY.version]]
+
+
+@pytest.mark.parametrize("missing", [1, 2])  # a plan has 3 periods
+def test_a_robot_outside_its_tube_after_missing_decisions_has_no_verified_plan(missing: int) -> None:
+    """As `BackupPlan`. Nothing compared its positions: wherever the robot was, its plan counted as verified."""
+    plans, single, free = BackupPlanBatch(SAFETY, 3), InProcess(SAFETY), ObstacleArrays.of([Shapes.of([], 2)] * 3)
+    state, go, asked = np.zeros(5), np.array([0.25, 0.0]), []
+    plans.decide(np.tile(state, (3, 1)), np.tile(go, (3, 1)), free)
+    answer = single.decide(state, go, known_free=True)
+    plans.safety = FAILING  # type: ignore[assignment]
+    for k in range(missing):
+        state = answer.predicted.center if k == 0 else np.append(answer.tube_center[k], np.zeros(3))
+        assert not plans.decide(np.tile(state, (3, 1)), np.tile(go, (3, 1)), free).decided.any()
+        single.request(single.backup_plan, state, go, known_free=True)
+        single.fallback()
+    plans.safety = Broken(None)  # type: ignore[assignment]
+    plans.safety.decide_batch = lambda requests: asked.append(requests) or SAFETY.decide_batch(requests)  # type: ignore
+    (center, *_), (half, *_) = answer.tube_center[missing], answer.tube_half_width[missing]
+    states = np.tile(state, (3, 1))
+    states[:, 0] = center + np.array([0.9, 1.1, np.nan]) * half
+    plans.decide(states, np.tile(go, (3, 1)), free)
+    models = [single.request(deepcopy(single.backup_plan), one, go, known_free=True).model for one in states]
+    assert asked[0].model == models == [SAFETY.version, UNVERIFIED, SAFETY.version]
 
 
 @pytest.mark.parametrize("safety", [lambda: SAFETY, one_step], ids=["periods", "windows"])
@@ -215,6 +239,13 @@ def test_an_observation_that_is_not_finite_costs_its_robot_alone_a_rivals_decisi
     outcome = plans.decide(np.zeros((2, 5)), np.tile([0.2, 0.0], (2, 1)), free, observations)
     assert outcome.decided.tolist() == [False, True] and outcome.inputs.tolist() == [[0.0, 0.0], [0.2, 0.0]]
     assert np.isnan(observations[0, 1]), "the caller's array stays"
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (2, 4), (5,), (1, 5)])
+def test_states_of_another_number_or_size_are_refused(shape: tuple[int, ...]) -> None:
+    plans, free = BackupPlanBatch(SAFETY, 2), ObstacleArrays.of([Shapes.of([], 2)] * 2)
+    with pytest.raises(BadRequest, match=r"states has shape .*: give \(2, 5\)"):
+        plans.decide(np.zeros(shape), np.zeros((2, 2)), free)
 
 
 def test_plans_of_other_robots_are_not_kept_in_batches() -> None:

@@ -13,6 +13,7 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Disc, Limit
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch
 from brakeline.safety.filter.batch.request_arrays import PredictionArrays, RequestArrays
 from brakeline.safety.filter.filter import Filter
@@ -310,6 +311,34 @@ def test_replicas_with_different_model_sets_keep_the_scores_of_each():
     for name in range(MODELS):
         assert answered(f"later {name}", 9.0) == 1.0
     assert answered("new", 0.1) == 1.0, "a client keeps the scores of few model sets"
+
+
+def test_a_score_counts_for_the_model_set_that_gave_it_also_if_it_verified_nothing():
+    """The first plan that is verified after some that were not is as wide as the robot needs."""
+    plan, box, still = BackupPlan(ROBOT), Prediction(np.zeros(5), np.full(5, 0.1), 0.0), np.zeros((N, 2))
+
+    def answered(model, score, verified=False):
+        plan.accept(still, model, box, verified, judges=True, score=score)
+        return plan.widening.factor
+
+    answered("old", None)
+    assert answered("old", 3.0) == pytest.approx(3.0 * RESERVE)
+    assert answered("old", 0.1, verified=True) == pytest.approx(3.0 * RESERVE)
+    assert answered("new", 9.0) == 1.0, "it starts without scores"
+    for _ in range(WINDOWS):
+        assert answered("new", 0.1) == 1.0
+    assert answered("old", 0.1) == pytest.approx(3.0 * RESERVE), "the scores of the new one are not its own"
+
+
+def test_a_robot_that_left_its_sets_before_its_first_verified_plan_has_wide_sets_after_it():
+    client, batch, post = InProcess(ready(), accept_bound=1.0), BackupPlanBatch(ready(), 1), cylinder(0.2, 0.0, 0.1)
+    for period in range(2 * N + 2):
+        blocked, state = period < 2 * N, np.array([0.0, 0.03 * (period == N + 1), 0.0, 0.0, 0.0])
+        near = [post] if blocked else POSTS
+        assert client.decide(state, np.zeros(2), near).verified != blocked
+        batch.decide(state[None], np.zeros((1, 2)), ObstacleArrays.of([Shapes.of(near, 2)]))
+        assert batch.widening[0] == pytest.approx(client.backup_plan.widening.factor)
+    assert client.backup_plan.widening.factor > 1.5
 
 
 def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():

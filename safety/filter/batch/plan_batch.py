@@ -77,15 +77,15 @@ class BackupPlanBatch:
         self.predicted = PredictionArrays(
             np.zeros((size, n)), np.zeros((size, n)), np.zeros(size), np.zeros(size, dtype=bool)
         )
-        # boxes of the next positions, from the last decisions' tubes: centers and half-widths; NaN where there is none
-        self._tube_center, self._tube_half_width = np.full((2, size, N, robot.position_dim), np.nan)
+        # boxes of the positions now and later, from the last decisions' tubes: centers and half-widths
+        self._tube = np.zeros((2, size, N + 1, robot.position_dim))
         self._status, self._still = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
         self._periods = np.zeros(size, dtype=np.int64)
         self._judged, self._widened = False, np.ones(size)  # factors by which the predicted sets were widened
         # scores of plans, and of all coordinates
         self._scores, self._place = np.zeros((size, 2, WINDOWS)), np.zeros(size, dtype=np.int64)
-        self._scored, self._outside_share = np.zeros(size, dtype=bool), 0.0
+        self._outside_share = 0.0
         self.reset(np.ones(size, dtype=bool))
 
     def reset(self, which: Flags) -> None:
@@ -93,9 +93,9 @@ class BackupPlanBatch:
         zero = self.robot.zero_input()
         self.input_in_force[which], self.plan[which], self._inputs[which] = zero, zero, zero
         self._status[which], self._still[which], self._periods[which] = STANDING, self.robot.horizon, 0
-        self.predicted.given[which], self._tube_center[which] = False, np.nan
+        self.predicted.given[which] = False
         if self.independent:
-            self._scores[which], self._scored[which] = 0.0, False
+            self._scores[which] = 0.0
 
     @property
     def widening(self) -> Array:
@@ -139,10 +139,15 @@ class BackupPlanBatch:
         The decision on a proposal that is not finite is a failsafe. Arrays in single precision are converted.
 
         observations (B, o): by which a rival decides; the filter does not need them.
+
+        Raises:
+            BadRequest: there is not one state of the robot's size for each robot.
         """
         states, actions, obstacles = np.asarray(states, float), np.asarray(actions, float), mapped(obstacles, _precise)
+        if states.shape != (sized := self.predicted.center.shape):
+            raise BadRequest("state", f"states has shape {states.shape}: give {sized}, a state for each robot")
         usable = _plausible(states)
-        self._status[usable & (self._status == VERIFIED) & self._left_tube(states)] = OPEN  # as `BackupPlan.measured`
+        self._status[usable & ~self.predicted.given & (self._status == VERIFIED) & ~self._in_tubes(states)] = OPEN
         if observations is not None:
             usable &= np.isfinite(observations).all(axis=1)
             observations = np.where(usable[:, None], observations, np.float32(0.0))
@@ -172,11 +177,13 @@ class BackupPlanBatch:
             errors = sets.errors(np, states, self.robot.heading)
         return np.asarray(sets.given & (errors <= sets.half_width + SAME_SET).all(axis=1))
 
-    def _left_tube(self, states: Array) -> Flags:
-        """Return which rows (B,) have no predicted set, and a measured position outside the tube's next box."""
-        center, half_width = self._tube_center[:, 0], self._tube_half_width[:, 0]
-        away = np.abs(states[:, : center.shape[1]] - center)
-        return np.asarray(~self.predicted.given & (away > half_width + SAME_SET).any(axis=1))  # NaN: there is no box
+    def _in_tubes(self, states: Array) -> Flags:
+        """Return whether the positions lie in the committed plans' tubes (B,): see `BackupPlan.still_verified`."""
+        (center, half_width), d = self._tube[:, :, 0], self.robot.position_dim
+        if not d:
+            return np.zeros(len(states), dtype=bool)
+        with np.errstate(all="ignore"):
+            return np.asarray((np.abs(states[:, :d] - center) <= half_width + SAME_SET).all(axis=1))
 
     def _shares_used(self, states: Array) -> Array:
         """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
@@ -198,8 +205,6 @@ class BackupPlanBatch:
         outside = self.predicted.given & _plausible(states) & ~self.contains(states)
         self._status[~decided & outside] = OPEN
         self.predicted.given[~decided] = False
-        for tube in (self._tube_center, self._tube_half_width):
-            tube[:] = np.append(tube[:, 1:], np.full_like(tube[:, :1], np.nan), axis=1)
         if answers is not None:
             self._accept(states, decided, answers)
         return self._advance(states)
@@ -207,20 +212,18 @@ class BackupPlanBatch:
     def _accept(self, states: Array, rows: Flags, answers: DecisionArrays) -> None:
         self._judged, asked = answers.judges, self.state_widening
         self._outside_share = answers.outside_share
-        first = rows & answers.verified & ~self._scored
-        self._scored |= first
-        self._judge(rows & ~first & answers.scored, answers.plan_score, answers.score)
+        self._judge(rows & answers.scored, answers.plan_score, answers.score)
         if not answers.judges:  # as `BackupPlan.accept`: the client scores the last period
             scores = self._shares_used(states) * self._widened
             scores = np.where(scores <= 1.0, 0.0, scores)
-            self._judge(rows & ~first & self.predicted.given, scores, scores)
+            self._judge(rows & self.predicted.given, scores, scores)
         self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
+        self._tube[:, rows, 1:] = answers.tube_center[rows], answers.tube_half_width[rows]
         self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)
         sets = self.predicted
         sets.center[rows], sets.half_width[rows] = answers.predicted_center[rows], answers.predicted_half_width[rows]
         sets.heading[rows] = answers.predicted_heading[rows]
-        self._tube_center[rows], self._tube_half_width[rows] = answers.tube_center[rows], answers.tube_half_width[rows]
         sets.given[rows] = np.isfinite(answers.predicted_center[rows]).all(axis=1)
 
     def _judge(self, rows: Flags, of_plans: Array, scores: Array) -> None:
@@ -234,6 +237,7 @@ class BackupPlanBatch:
         robot, now = self.robot, self.plan[:, 0].copy()
         self._states = np.concatenate([self._states[:, 1:], states[:, None]], axis=1)
         self._inputs = np.concatenate([self._inputs[:, 1:], now[:, None]], axis=1)
+        self._tube = np.concatenate([self._tube[:, :, 1:], self._tube[:, :, -1:]], axis=2)
         self._periods = np.where(_plausible(states), self._periods + 1, 0)  # a gap ends the window
         rests = robot.is_stop_input(now)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[:, -1])
