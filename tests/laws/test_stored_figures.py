@@ -6,6 +6,7 @@ import json
 import math
 import re
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
+ROBOTS = ("ground", "quadrotor")
 
 
 @cache
@@ -105,6 +107,37 @@ def test_the_pages_say_how_sure_the_difference_to_the_barrier_function_is(page: 
     text = " ".join((ROOT / page).read_text().split())
     assert f"{100 * difference:.1f} percentage points" in text
     assert f"{100 * (difference - half):.1f} to {100 * (difference + half):.1f} by Welch's t-test" in text
+
+
+def blocked(robot: str, method: str, arena: str) -> tuple[float, float, str]:
+    """Return two shares of an evaluation's interventions, and which of the time-outs had more than two thirds of steps.
+
+    The shares are of failsafes, and of time-outs.
+    """
+    evaluations = [cell["evaluations"][evaluation_name(method, arena)] for cell in cells(robot, method)]
+    names = ("interventions", "steps", "timeout")
+    corrected, steps, late = (
+        np.concatenate([evaluation["episodes"][name] for evaluation in evaluations]) for name in names
+    )
+    failsafes, out = sum(evaluation["logged"]["failsafes"] for evaluation in evaluations), late.astype(bool)
+    most = (corrected[out] > 2.0 / 3.0 * steps[out]).sum()
+    return failsafes / corrected.sum(), corrected[out].sum() / corrected.sum(), f"{most} of {out.sum()}"
+
+
+def test_the_pages_say_how_often_the_predictive_filter_finds_no_plan() -> None:
+    arenas = ("default", "dense")
+    shares = {key: blocked(*key) for key in product(ROBOTS, ("psf", "cbf"), arenas)}
+    assert all(share[0] < 0.01 for (_, method, _), share in shares.items() if method == "cbf")
+    text = " ".join((ROOT / "docs/rivals.md").read_text().split())
+    pairs = {robot: [shares[robot, "psf", arena] for arena in arenas] for robot in ROBOTS}
+    without = {robot: " and ".join(f"{100 * share:.0f}" for share, _, _ in pair) for robot, pair in pairs.items()}
+    late = " and ".join(f"{100 * share:.0f}" for _, share, _ in pairs["ground"])
+    assert f"{without['ground']} % of PSF's interventions on the ground, and {without['quadrotor']} % in" in text
+    assert f"On the ground, {late} % of PSF's interventions lie in episodes that run out of time" in text
+    for robot, ((_, _, default), (_, _, dense)) in pairs.items():
+        text = " ".join((ROOT / f"docs/results_{robot}.md").read_text().split())
+        most, out = default.split(" of ")
+        assert f"In {most} of PSF's {out} time-outs in `default`, and in {dense} in `dense`" in text
 
 
 def sac_cells(robot: str, method: str, rate: float) -> list[dict[str, Any]]:
