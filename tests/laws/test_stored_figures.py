@@ -16,6 +16,7 @@ from scipy.special import stdtrit
 
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import evaluation_name, steps_to_learn
+from brakeline.learner.lagrange import LagrangeMultiplier
 from tests.laws.page_tables import table_rows
 
 pytestmark = pytest.mark.fast
@@ -138,6 +139,27 @@ def test_the_pages_say_how_often_the_predictive_filter_finds_no_plan() -> None:
         text = " ".join((ROOT / f"docs/results_{robot}.md").read_text().split())
         most, out = default.split(" of ")
         assert f"In {most} of PSF's {out} time-outs in `default`, and in {dense} in `dense`" in text
+
+
+def test_the_page_says_how_far_the_multiplier_of_td3_lagrange_rose() -> None:
+    text = " ".join((ROOT / "docs/rivals.md").read_text().split())
+    costs, collided, ranges = [], [], []
+    for robot in ROBOTS:
+        highest, stored = [], cells(robot, "lagrange")
+        for cell in stored:
+            td3, episodes = cell["study"]["td3"], cell["training"]["episodes"]
+            multiplier, values = LagrangeMultiplier(td3["cost_limit"], td3["multiplier_rate"]), [0.0]
+            for number in np.argsort(episodes["end"], kind="stable"):
+                multiplier.end_episode(bool(episodes["collision"][number]))
+                values.append(multiplier.value)
+            highest.append(max(values))
+            assert multiplier.value > 0.98 * max(values), "it rises to the end, so it has not settled"
+        ranges.append(f"{min(highest):.0f} to {max(highest):.0f}")
+        costs.append(f"{100 + max(highest):.0f}")
+        collided.append(f"{100 * np.mean([np.mean(cell['training']['episodes']['collision']) for cell in stored]):.1f}")
+    assert f"no training reached the limit: {collided[0]} % (ground) and {collided[1]} % (air)" in text
+    assert f"rose to {ranges[0]} on the ground, and to {ranges[1]} in the air" in text
+    assert f"a collision cost at most {' and '.join(costs)} instead of 100" in text
 
 
 def sac_cells(robot: str, method: str, rate: float) -> list[dict[str, Any]]:
