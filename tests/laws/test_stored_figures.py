@@ -135,6 +135,13 @@ def test_the_pages_say_how_often_the_predictive_filter_finds_no_plan() -> None:
     late = " and ".join(f"{100 * share:.0f}" for _, share, _ in pairs["ground"])
     assert f"{without['ground']} % of PSF's interventions on the ground, and {without['quadrotor']} % in" in text
     assert f"On the ground, {late} % of PSF's interventions lie in episodes that run out of time" in text
+    learning = [[cell["training"] for cell in cells(robot, "psf")] for robot in ROBOTS]
+    of_steps = [
+        sum(one["logged"]["failsafes"] for one in stored) / sum(one["steps"] for one in stored) for stored in learning
+    ]
+    text = " ".join((ROOT / "docs/results.md").read_text().split())
+    ground, air = (f"{100 * share:.0f} %" for share in of_steps)
+    assert f"In {ground} of its training steps on the ground, and in {air} in the air, PSF finds no plan" in text
     for robot, ((_, _, default), (_, _, dense)) in pairs.items():
         text = " ".join((ROOT / f"docs/results_{robot}.md").read_text().split())
         most, out = default.split(" of ")
