@@ -6,6 +6,7 @@ import json
 import math
 import re
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ from scipy.special import stdtrit
 
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import evaluation_name, steps_to_learn
+from brakeline.learner.lagrange import LagrangeMultiplier
 from tests.laws.page_tables import table_rows
 
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
+ROBOTS = ("ground", "quadrotor")
 
 
 @cache
@@ -105,6 +108,65 @@ def test_the_pages_say_how_sure_the_difference_to_the_barrier_function_is(page: 
     text = " ".join((ROOT / page).read_text().split())
     assert f"{100 * difference:.1f} percentage points" in text
     assert f"{100 * (difference - half):.1f} to {100 * (difference + half):.1f} by Welch's t-test" in text
+
+
+def blocked(robot: str, method: str, arena: str) -> tuple[float, float, str]:
+    """Return two shares of an evaluation's interventions, and which of the time-outs had more than two thirds of steps.
+
+    The shares are of failsafes, and of time-outs.
+    """
+    evaluations = [cell["evaluations"][evaluation_name(method, arena)] for cell in cells(robot, method)]
+    names = ("interventions", "steps", "timeout")
+    corrected, steps, late = (
+        np.concatenate([evaluation["episodes"][name] for evaluation in evaluations]) for name in names
+    )
+    failsafes, out = sum(evaluation["logged"]["failsafes"] for evaluation in evaluations), late.astype(bool)
+    most = (corrected[out] > 2.0 / 3.0 * steps[out]).sum()
+    return failsafes / corrected.sum(), corrected[out].sum() / corrected.sum(), f"{most} of {out.sum()}"
+
+
+def test_the_pages_say_how_often_the_predictive_filter_finds_no_plan() -> None:
+    arenas = ("default", "dense")
+    shares = {key: blocked(*key) for key in product(ROBOTS, ("psf", "cbf"), arenas)}
+    assert all(share[0] < 0.01 for (_, method, _), share in shares.items() if method == "cbf")
+    text = " ".join((ROOT / "docs/rivals.md").read_text().split())
+    pairs = {robot: [shares[robot, "psf", arena] for arena in arenas] for robot in ROBOTS}
+    without = {robot: " and ".join(f"{100 * share:.0f}" for share, _, _ in pair) for robot, pair in pairs.items()}
+    late = " and ".join(f"{100 * share:.0f}" for _, share, _ in pairs["ground"])
+    assert f"{without['ground']} % of PSF's interventions on the ground, and {without['quadrotor']} % in" in text
+    assert f"On the ground, {late} % of PSF's interventions lie in episodes that run out of time" in text
+    learning = [[cell["training"] for cell in cells(robot, "psf")] for robot in ROBOTS]
+    of_steps = [
+        sum(one["logged"]["failsafes"] for one in stored) / sum(one["steps"] for one in stored) for stored in learning
+    ]
+    text = " ".join((ROOT / "docs/results.md").read_text().split())
+    ground, air = (f"{100 * share:.0f} %" for share in of_steps)
+    assert f"In {ground} of its training steps on the ground, and in {air} in the air, PSF finds no plan" in text
+    for robot, ((_, _, default), (_, _, dense)) in pairs.items():
+        text = " ".join((ROOT / f"docs/results_{robot}.md").read_text().split())
+        most, out = default.split(" of ")
+        assert f"In {most} of PSF's {out} time-outs in `default`, and in {dense} in `dense`" in text
+
+
+def test_the_page_says_how_far_the_multiplier_of_td3_lagrange_rose() -> None:
+    text = " ".join((ROOT / "docs/rivals.md").read_text().split())
+    costs, collided, ranges = [], [], []
+    for robot in ROBOTS:
+        highest, stored = [], cells(robot, "lagrange")
+        for cell in stored:
+            td3, episodes = cell["study"]["td3"], cell["training"]["episodes"]
+            multiplier, values = LagrangeMultiplier(td3["cost_limit"], td3["multiplier_rate"]), [0.0]
+            for number in np.argsort(episodes["end"], kind="stable"):
+                multiplier.end_episode(bool(episodes["collision"][number]))
+                values.append(multiplier.value)
+            highest.append(max(values))
+            assert multiplier.value > 0.98 * max(values), "it rises to the end, so it has not settled"
+        ranges.append(f"{min(highest):.0f} to {max(highest):.0f}")
+        costs.append(f"{100 + max(highest):.0f}")
+        collided.append(f"{100 * np.mean([np.mean(cell['training']['episodes']['collision']) for cell in stored]):.1f}")
+    assert f"no training reached the limit: {collided[0]} % (ground) and {collided[1]} % (air)" in text
+    assert f"rose to {ranges[0]} on the ground, and to {ranges[1]} in the air" in text
+    assert f"a collision cost at most {' and '.join(costs)} instead of 100" in text
 
 
 def sac_cells(robot: str, method: str, rate: float) -> list[dict[str, Any]]:

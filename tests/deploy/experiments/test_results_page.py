@@ -178,6 +178,18 @@ def test_the_page_says_which_learners_had_mirrored_steps(results, monkeypatch, m
         assert ("learns from mirrored steps" in rows[f"learner of {learner}"]) == (mirrored == "turns")
 
 
+def test_the_page_names_no_penalty_for_sailr_which_pays_none(results):
+    """An intervention ends its episodes of training: `tests/deploy/run/test_batch_trainer.py`."""
+    (cell,) = cell_configs("ground", ("sailr",), (0,))
+    trials = {f"trained-sailr-{arena}": evaluation(90, 0) for arena in ("default", "dense")}
+    training, model = evaluation(90, 0) | {"steps": 60_000}, {"version": "1", "samples": "80000", "collisions": "770"}
+    result = {"study": configuration(replace(cell, physics=2)), "model": model, "training": training}
+    (results / "ground" / "sailr-s0.json").write_text(json.dumps(result | {"evaluations": trials}))
+    lines = [line for line in page(results, ["ground"]).splitlines() if "| learner of" in line]
+    (sailr,) = (line for line in lines if "SAILR" in line)
+    assert "no penalty for corrections" in sailr and any("penalty for corrections 1" in line for line in lines)
+
+
 def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
     assert CompareCommand(("ground",), table=True, results=results, quiet=True).run() == 0
     assert (results / "README.md").read_text() == page(results, ["ground"])
