@@ -13,7 +13,9 @@ inputs by a first-order lag of time constant τ; the model is a unicycle, or a v
 Sequential quadratic programming solves it. Each program linearises the predicted positions in the inputs, and each
 distance at its closest point. The first attempt starts at the proposal, the second one at the last plan, the third one
 at standing. Without a solution, the robot follows its last plan, as in the article. The model is nominal, so the margin
-alone allows for its error. The stochastic and robust versions in the article tighten constraints instead.
+alone allows for its error. The stochastic and robust versions in the article tighten constraints instead. The margin is
+soft: where errors have brought the robot nearer than the margin, a plan must only come no nearer than the last one.
+With a hard margin, a robot that stands a millimetre inside it would have no plan any more, not even to turn away.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ STANDING = 4.0  # time constants after the first zero input until the robot coun
 ITERATIONS = 5  # quadratic programs from one start
 CONVERGED = 1e-4  # of an input's range
 LEAST_SLOPE = 1e-4  # m for an input's whole range: rows with smaller gradients are left out
-ACCURACY = 1e-4  # m: a constraint violated by less is met
+ACCURACY = 1e-5  # m: a constraint violated by less is met
 LATER = 1e-2  # weight of later inputs in the cost; that of the first one is 1
 STEP = 1e-4  # of an input's range, for derivatives
 
@@ -57,16 +59,20 @@ class PredictiveFilter(RivalByHand):
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
         """Return the closest plan of the nominal model that is clear; without one, go on with the last plan."""
         wanted = braking_plan(self.robot, proposal)
-        room = self._room(request, wanted)
+        margin = self.settings["margin"]
+        margin += min(self._room(request, request.plan, margin), 0.0)
+        room = self._room(request, wanted, margin)
         if room >= -ACCURACY:
             return self.decision(ALLOWED, wanted, room, started)
         starts = (wanted, request.plan, np.zeros_like(request.plan))
-        plan = next((plan for start in starts if (plan := self._solve(request, proposal, start)) is not None), None)
+        solved = (self._solve(request, proposal, start, margin) for start in starts)
+        plan = next((plan for plan in solved if plan is not None), None)
         if plan is None:
             reason = "the nominal model has no clear plan: the last one goes on"
-            return self.decision(FAILSAFE, request.plan, self._room(request, request.plan), started, reason=reason)
+            last = self._room(request, request.plan, margin)
+            return self.decision(FAILSAFE, request.plan, last, started, reason=reason)
         reason = f"the proposal comes {-room:.3g} m too near by the nominal model"
-        return self.decision(ADJUSTED, plan, self._room(request, plan), started, reason=reason)
+        return self.decision(ADJUSTED, plan, self._room(request, plan, margin), started, reason=reason)
 
     def positions(self, state: Array, plans: Array) -> Array:
         """Return the positions (P, T, d) that the nominal model predicts for plans (P, N, m) until the robot stands."""
@@ -88,20 +94,20 @@ class PredictiveFilter(RivalByHand):
         positions: Array = state[: robot.position_dim] + np.cumsum(travelled, axis=1)
         return positions
 
-    def _room(self, request: Request, plan: Array) -> float:
-        """Return the least distance from the path of a plan to an obstacle, less the margin [m]."""
+    def _room(self, request: Request, plan: Array, margin: float) -> float:
+        """Return the least distance from the path of a plan to an obstacle, less a margin [m]."""
         path = self.positions(request.state, plan[None])[0]
         lengths, _ = self.distances(request, path)
-        return float(lengths.min(initial=math.inf)) - self.settings["margin"]
+        return float(lengths.min(initial=math.inf)) - margin
 
-    def _solve(self, request: Request, proposal: Array, start: Array) -> Array | None:
+    def _solve(self, request: Request, proposal: Array, start: Array, margin: float) -> Array | None:
         """Return the plan (N, m) to which the programs converge from a start, if the nominal model is clear on it."""
         robot, free = self.robot, self._free
         limits, most = self._limits(request.input_in_force)
         wanted = (braking_plan(robot, proposal)[:free] / self._scale).ravel()
         z = (start[:free] / self._scale).ravel()
         for _ in range(ITERATIONS):
-            A, b = self._rows(request, z)
+            A, b = self._rows(request, z, margin)
             program = QuadraticProgram(
                 self._cost, -self._cost * wanted, np.vstack([A, limits]), np.concatenate([b, most]), len(limits)
             )
@@ -112,7 +118,7 @@ class PredictiveFilter(RivalByHand):
             if moved < CONVERGED:
                 break
         plan = self._plan(z, request.input_in_force)
-        return plan if self._room(request, plan) >= -ACCURACY else None
+        return plan if self._room(request, plan, margin) >= -ACCURACY else None
 
     def _limits(self, before: Array) -> tuple[Array, Array]:
         """Return the bounds and the slew as rows A z <= b. before: the input in force."""
@@ -132,14 +138,14 @@ class PredictiveFilter(RivalByHand):
         inputs[0] = self.robot.clip_input(inputs[0], before)
         return np.vstack([inputs, np.zeros((1, self.robot.action_dim))])
 
-    def _rows(self, request: Request, z: Array) -> tuple[Array, Array]:
+    def _rows(self, request: Request, z: Array, margin: float) -> tuple[Array, Array]:
         """Return the distances that the inputs can change, linearised, as rows A z <= b of unit length."""
         steps = np.vstack([np.zeros_like(z), STEP * np.eye(len(z))])
         path = self.positions(request.state, np.stack([self._unclipped(z + step) for step in steps]))
         slopes = (path[1:] - path[0]) / STEP  # (free inputs, samples, d)
         lengths, normals = self.distances(request, path[0])
         rows = -np.einsum("isd,fsd->isf", normals, slopes).reshape(-1, len(z))
-        level = (lengths - self.settings["margin"]).ravel() + rows @ z
+        level = (lengths - margin).ravel() + rows @ z
         sizes = np.linalg.norm(rows, axis=1)
         changes = sizes > LEAST_SLOPE
         return rows[changes] / sizes[changes, None], level[changes] / sizes[changes]

@@ -9,9 +9,11 @@ from brakeline.deploy.data.rival_pretraining import BarrierConfig, PredictiveCon
 from brakeline.errors import BadModel, BadRequest, UnknownTask
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.task import Rivals, with_task
+from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
 from brakeline.safety.methods import decode, ready
 from brakeline.safety.model.model_config import CBF, PSF
+from brakeline.safety.rivals import predictive_filter
 from brakeline.safety.rivals.predictive_filter import PredictiveFilter
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
@@ -72,14 +74,22 @@ def test_the_predictive_filter_finds_the_closest_clear_plan():
     for speed in np.linspace(0.0, 0.25, 26):
         for turn in np.linspace(-0.5, 0.5, 11):
             plan = np.array([[speed, turn], [0.0, 0.0], [0.0, 0.0]])
-            clear = PREDICTIVE._room(ask, plan) >= 0.0
+            clear = PREDICTIVE._room(ask, plan, 0.01) >= 0.0
             assert not clear or np.linalg.norm((plan[0] - FAST) / [0.25, 1.0]) >= away - 1e-2
 
 
-def test_the_predictive_filter_goes_on_with_its_last_plan_where_it_finds_none():
+def test_the_predictive_filter_goes_on_with_its_last_plan_where_it_finds_none(monkeypatch):
+    monkeypatch.setattr(predictive_filter, "solve", lambda program: INFEASIBLE)
     last = np.array([[0.05, 0.1], [0.02, 0.0], [0.0, 0.0]])
     decision = PREDICTIVE.decide(request(obstacles=[cylinder(0.2, 0.0)], state=(0.0, 0.0, 0.0, 0.25, 0.0), plan=last))
     assert decision.kind == FAILSAFE and np.array_equal(decision.plan, last) and "last one" in decision.reason
+
+
+@pytest.mark.parametrize(("wanted", "kind"), [((0.0, 0.5), ALLOWED), ((-0.1, 0.0), ALLOWED), ((0.25, 0.0), ADJUSTED)])
+def test_a_robot_that_stands_inside_the_margin_may_turn_and_drive_away(wanted, kind):
+    """With a hard margin, it had no plan until its episode ended."""
+    decision = PREDICTIVE.decide(request(obstacles=[wall(0.105 + 0.01 - 0.001)], action=wanted))
+    assert decision.kind == kind and decision.plan[0, 0] <= 1e-4
 
 
 @pytest.mark.parametrize("method", [BARRIER, PREDICTIVE])
