@@ -311,6 +311,16 @@ def test_a_period_is_not_proposed_to_itself(driven, tmp_path, capsys):
     assert "of the periods an input changed" in text and "multiples of 0.1 s" not in text, (status, text)
 
 
+def test_a_converted_column_is_in_si_whatever_its_name_says(driven, tmp_path, capsys):
+    values = driven[1].copy()
+    values[:, HEADING] = np.degrees(values[:, HEADING])
+    path, robot = write_csv(tmp_path / "drive.csv", driven[0], values), tmp_path / "my.toml"
+    path.write_text(path.read_text().replace("heading", "yaw_deg", 1))
+    assert main(["robot", "new", str(robot), "--from", str(path), "--unit", "yaw_deg=deg"]) == 0
+    note = "Requests and decisions have yaw_deg in rad, whatever its name says"
+    assert note in " ".join(capsys.readouterr().out.split()) and note in robot.read_text()
+
+
 def test_an_error_below_the_noise_at_rest_is_noted(tmp_path, capsys):
     """The porter's positions are measured within 4 mm."""
     rng = np.random.default_rng(1)
