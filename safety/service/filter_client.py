@@ -83,8 +83,8 @@ class FilterClient(Protocol):
             state: (n,) measured, in the order and the units of the robot's description (`Robot.state`).
             action: (m,) proposed, in the order and the units of the description (`Robot.action`). If it holds NaN or
                 infinity, the decision is a failsafe.
-            obstacles: at least those within the robot's `sight` of the measured position (1 m for `ground`), and the
-                moving ones that may come so near before a plan ends.
+            obstacles: in the frame of the state's position; at least those within the robot's `sight` of the measured
+                position (1 m for `ground`), and the moving ones that may come so near before a plan ends.
             scan: a sensor's measurement, instead of obstacles or in addition: a `Scan`, or a `RangeImage` in space.
                 Fill it in with `brakeline.filled` first.
             observation: the task's observation. Only the rivals read it.
