@@ -325,9 +325,8 @@ def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, de
     notes = [f"{name}: the robot responds {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
     notes += [
         f"{name}: the delay is above one period ({robot.period:g} s), but predictions use one earlier input only. If "
-        "`certify` finds wide sets, choose a longer period. Shift the stamps with "
-        f"--delay {d:.3g} only if they are wrong: if the robot itself responds late, the filter would then expect it "
-        "to respond at once, and verify plans that hit obstacles."
+        f"`certify` finds wide sets, choose a longer period. --delay {d:.3g} is only for wrong time stamps: if the "
+        "robot itself responds late, the filter would then expect it to respond at once."
         for name, d in delays.items()
         if d > 1.01 * robot.period
     ]
