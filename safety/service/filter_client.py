@@ -77,7 +77,10 @@ class FilterClient(Protocol):
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
-        """Request the decision on an action and commit to its plan. Then execute `answer.action`.
+        """Request the decision on an action and commit to its plan. Then execute `answer.action` for one period.
+
+        Call `decide` (or `fallback`) exactly once a period of the description. A program that calls it more often or
+        more rarely executes other plans than the predicted ones, so the filter widens its sets.
 
         Args:
             state: (n,) measured, in the order and the units of the robot's description (`Robot.state`).
