@@ -40,6 +40,9 @@ KINDS = (BOX, CYLINDER, SPHERE, WALL)
 class Obstacle:
     """One obstacle in the plane or in space, by the length of `position`.
 
+    Position and yaw are in the frame of the state's position, such as that of the map or the odometry. They are not in
+    the robot's frame: transform an obstacle that a sensor on the robot saw, or give the filter a `Scan`.
+
     >>> Obstacle("cylinder", position=(0.4, 0.0), size=(0.1,)).kind
     'cylinder'
 

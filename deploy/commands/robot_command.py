@@ -188,7 +188,7 @@ def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: Log
         NoSource: a log cannot be used, or does not show enough for a description without mistakes.
         LogError: the log of a run cannot be read.
     """
-    from brakeline.deploy.data.description_template import fill_template
+    from brakeline.deploy.data.description_template import delay_notes, fill_template
     from brakeline.deploy.data.embedded_description import read_embedded_description
     from brakeline.deploy.data.importer import own_log, tables_of
     from brakeline.deploy.data.schema_inference import infer_schema, without_inputs
@@ -210,7 +210,7 @@ def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: Log
         except (BadDescription, tomllib.TOMLDecodeError) as error:
             problems = str(error)
         else:
-            return text, (*one.notes, NOT_SHOWN)
+            return text, (*one.notes, *delay_notes(one), NOT_SHOWN)
     reasons = "\n  ".join((*schema.notes, problems))
     raise NoSource(
         f"{names}: no description without mistakes follows from it. Name the columns with --map, or drive so that "

@@ -91,7 +91,8 @@ def coverage(data: Dataset) -> Coverage:
     missing = _stops_missing(robot, stops, rested)
     missing += [text for one in seen for text in _unreached_bounds(one)]
     missing += [text for one in braked for text in _unbraked_ranges(one)]
-    missing += _windows_missing(plans, free, linear=bool(robot.feedback))
+    few = _windows_missing(plans, free, linear=bool(robot.feedback))
+    missing += few or _plans_missing(data)
     return Coverage((*seen, *followers), stops, plans, free, tuple(missing))
 
 
@@ -152,6 +153,21 @@ def _windows_missing(plans: int, free: int, linear: bool) -> list[str]:
             "with free windows: hold an input for one period, then stop by the description's rules"
         ]
     return []
+
+
+def _plans_missing(data: Dataset) -> list[str]:
+    """Return what is missing if so few plans cannot state the robot's limit, even with none of them outside."""
+    robot = data.robot
+    limit, wanted = robot.accept_bound, plans_needed(robot.accept_bound)
+    plans = sum(len(t.inputs) // robot.horizon for t in data.joined().trajectories)
+    if not 0 < plans < wanted or robot.feedback:  # a robot that stops by feedback has linear model sets
+        return []
+    more = math.ceil(data.periods * robot.period / 60.0 * (wanted / plans - 1.0))
+    return [
+        f"at most {plans} plans of {robot.horizon} periods that do not overlap, so a model set states that at most "
+        f"{percent(upper_bound(0, plans))} of plans leave their tubes, or more, and the limit is {percent(limit)}: "
+        f"record {more} more minute{'s' * (more > 1)} like these, or write a larger `accept_bound` into the description"
+    ]
 
 
 def recording_advice(report: ValidationReport, data: Dataset) -> list[str]:

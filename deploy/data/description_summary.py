@@ -9,6 +9,7 @@ import numpy as np
 from brakeline.messaging.labels import split_label
 from brakeline.messaging.robot import HOLD, RAMP, Array, Robot
 
+TEMPLATE_BODY = 0.2  # m: radius of the only disc of a new description, until somebody measures the robot
 INFEASIBLE = 2  # scipy's status of a linear program without a solution
 
 
@@ -27,6 +28,17 @@ def nominal_stopping_distance(robot: Robot) -> float | None:
     if not speeds:
         return None
     return float(np.linalg.norm(np.abs(full_stop_inputs(robot)[:, speeds]).sum(0))) * robot.period
+
+
+def body_extent(robot: Robot) -> dict[str, float]:
+    """Return how far the discs reach from the position of a robot with a heading [m]; empty for any other robot."""
+    if robot.heading is None or robot.position_dim != 2:
+        return {}
+    sides = {"ahead": (1.0, 0.0), "behind": (-1.0, 0.0), "to_the_left": (0.0, 1.0), "to_the_right": (0.0, -1.0)}
+    return {
+        f"body_{side}_m": max(float(np.dot(disc.at, axis)) + disc.radius for disc in robot.body)
+        for side, axis in sides.items()
+    }
 
 
 def stands_somewhere(robot: Robot) -> bool:
@@ -62,6 +74,11 @@ def remarks(robot: Robot) -> list[str]:
     free = [label for label, index in zip(robot.action, robot.follows, strict=True) if index < 0]
     candidates = (
         (
+            [(not any(disc.at), disc.radius) for disc in robot.body] == [(True, TEMPLATE_BODY)],
+            f"body: one disc of {TEMPLATE_BODY:g} m around the position, as in the template. The filter keeps only "
+            "this disc clear of obstacles, so measure the robot.",
+        ),
+        (
             robot.position_dim > 0 and distance + robot.footprint > robot.sight,
             f"sight: a stop from full speed takes about {distance:.2f} m and the body reaches {robot.footprint:.2f} m, "
             f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving.",
@@ -89,6 +106,7 @@ def summary(robot: Robot) -> dict[str, Any]:
     rules = zip(robot.action, robot.action_low, robot.action_high, robot.action_slew, robot.stop, strict=True)
     distance = nominal_stopping_distance(robot)
     position = {"way_to_a_stop_m": distance, "footprint_m": robot.footprint, "discs": len(robot.body)}
+    position |= body_extent(robot)
     return {
         "name": robot.name,
         "period_s": robot.period,

@@ -13,6 +13,7 @@ BARE = re.compile(r"[A-Za-z0-9_-]+")
 ERRORS = {"position": 0.01, "heading": 0.02}  # measurement errors of the template
 ERROR = 0.05
 MOST_PERIODS = 64  # longest plan
+LATE = 1.5  # periods: a longer delay is not that of a lag alone, which the measured speeds show
 UNKNOWN = "cannot be inferred from the log"
 
 
@@ -42,6 +43,20 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
         template = re.sub(pattern, text, template, flags=re.MULTILINE)
     about = [f"# Inferred from {source}. Check every line: the log shows what the robot did, not what it can do."]
     return "\n".join((*about, *(f"# {note}" for note in schema.notes), template))
+
+
+def delay_notes(schema: InferredSchema) -> tuple[str, ...]:
+    """Return a note if a coordinate responds so late that the predictions, which use one earlier input, miss inputs."""
+    late = [(one.delay, one.name) for one in schema.states if one.delay is not None]
+    delay, name = max(late, default=(0.0, ""))
+    if delay <= LATE * schema.period:
+        return ()
+    longer = math.ceil(round(delay / schema.period, 3)) * schema.period
+    return (
+        f"{name} responds about {1e3 * delay:.0f} ms after its input, but predictions use one earlier input only, so "
+        f"with `period = {schema.period:g}` the sets will be wide. If you can, let your controller hold each input for "
+        f"{longer:.3g} s, and record again. The file then has `period = {longer:.3g}`",
+    )
 
 
 def _verbatim(*lines: str) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from brakeline.deploy.data.sources.isolated_reader import USUAL_LIMITS, ReadLimits
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.deploy.data.stamps import TIME
-from brakeline.deploy.data.unit_table import chosen_units
+from brakeline.deploy.data.unit_table import chosen_units, si_of
 from brakeline.errors import NoSource
 
 CHOSEN_RANK = -1000  # of a table that the user names: before all others
@@ -57,6 +57,16 @@ class LogOptions:
         if unknown := [topic for topic in self.topics if topic not in names]:
             raise NoSource(f"--topics {unknown[0]}: the source has only {', '.join(filter(None, names)) or 'columns'}")
         return [replace(t, rank=CHOSEN_RANK) if t.name in self.topics else t for t in tables]
+
+    def conversion_notes(self) -> list[str]:
+        """Return a note for each converted column: its name may still state the unit of the log."""
+        converted = {name: (unit, si_of(unit)) for name, unit in self.units.items() if name != TIME}
+        return [
+            f"{name}: --unit converts the log from {unit} to {si}. Requests and decisions have {name} in {si}, "
+            "whatever its name says"
+            for name, (unit, si) in converted.items()
+            if si not in ("", unit)
+        ]
 
     def words(self) -> str:
         """Return the options as words of a command line, as a shell takes them."""

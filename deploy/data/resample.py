@@ -40,6 +40,7 @@ MAX_SAMPLES = 20  # positions per period
 FAR = 10.0  # times an input's larger bound
 SAME = 1e-6  # s: closer times are the same, but for rounding
 LIKE_A_BEAT = 0.9  # share of the times between changes that are multiples of a beat
+SAME_BEAT = 0.005  # of the period: jitter of the stamps moves the beat that a log shows by as much
 NEAR_MULTIPLE = 0.05  # of a beat: how far from a multiple of it the period counts as one
 PHASES = 40  # bins of the phase at which inputs change
 
@@ -117,7 +118,7 @@ def resample(
     uneven = float(np.concatenate([changed for _, changed, _ in resampled]).mean())
     delays = _delays(recordings, robot)
     notes += small_errors(robot, parts)
-    notes += _beat_notes(recordings, robot, uneven)
+    notes += _beat_notes(recordings, robot, uneven, max(delays.values(), default=0.0))
     notes += [*_notes(robot, samples, chord_deviation, uneven, delays), *responses]
     return ImportedData(
         data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, uneven, tuple(notes))
@@ -282,8 +283,11 @@ def _beyond(recordings: Sequence[GapFreeRecording], robot: Robot) -> str:
     return "; ".join(ranges)
 
 
-def _beat_notes(recordings: Sequence[GapFreeRecording], robot: Robot, uneven: float) -> list[str]:
-    """Return a note if the inputs change at multiples of another time than the period, or within many periods."""
+def _beat_notes(recordings: Sequence[GapFreeRecording], robot: Robot, uneven: float, delay: float) -> list[str]:
+    """Return a note if the inputs change at multiples of another time than the period, or within many periods.
+
+    The note proposes no period below the largest delay [s], because predictions use one earlier input only.
+    """
     between = [
         np.diff(np.unique(np.concatenate([time[1:][np.diff(v) != 0.0] for time, v in r.inputs]))) for r in recordings
     ]
@@ -292,12 +296,19 @@ def _beat_notes(recordings: Sequence[GapFreeRecording], robot: Robot, uneven: fl
     if beat is None or beat.share < LIKE_A_BEAT:
         return []
     ratio = robot.period / beat.seconds
+    if abs(ratio - 1.0) < SAME_BEAT:
+        return []
     if abs(ratio - round(ratio)) < NEAR_MULTIPLE and ratio > 0.5 and uneven < 1.0 - MOSTLY:
         return []
-    return [
+    seen = (
         f"the inputs change at multiples of {beat.seconds:.3g} s, but the description's period is {robot.period:g} s: "
-        f"if your controller sends inputs every {beat.seconds:.3g} s, write `period = {beat.seconds:.3g}`"
-    ]
+    )
+    if delay > beat.seconds and ratio > 1.0:
+        return [
+            f"{seen}keep that period, because the delay is longer than {beat.seconds:.3g} s. If you can, let your "
+            f"controller hold each input for {robot.period:g} s, and record again"
+        ]
+    return [f"{seen}if your controller sends inputs every {beat.seconds:.3g} s, write `period = {beat.seconds:.3g}`"]
 
 
 def _delays(recordings: list[GapFreeRecording], robot: Robot) -> dict[str, float]:
@@ -314,8 +325,8 @@ def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, de
     notes = [f"{name}: the robot responds {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
     notes += [
         f"{name}: the delay is above one period ({robot.period:g} s), but predictions use one earlier input only. If "
-        f"the time stamps are wrong, shift them with --delay {d:.3g}. Otherwise, if `certify` finds wide sets, choose "
-        "a longer period."
+        f"`certify` finds wide sets, choose a longer period. --delay {d:.3g} is only for wrong time stamps: if the "
+        "robot itself responds late, the filter would then expect it to respond at once."
         for name, d in delays.items()
         if d > 1.01 * robot.period
     ]

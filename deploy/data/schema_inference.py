@@ -176,7 +176,7 @@ def _read(sources: Sequence[Sequence[Table]], options: LogOptions) -> tuple[Alig
     log = joined(logs)
     if lost := sorted({name for one in logs for name in one.columns} - set(log.columns)):
         notes.append(f"left out, as not every log has them: {', '.join(lost)}")
-    return log, notes
+    return log, notes + options.conversion_notes()
 
 
 def _period(log: AlignedLog) -> tuple[float, str]:

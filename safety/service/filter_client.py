@@ -77,14 +77,17 @@ class FilterClient(Protocol):
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
-        """Request the decision on an action and commit to its plan. Then execute `answer.action`.
+        """Request the decision on an action and commit to its plan. Then execute `answer.action` for one period.
+
+        Call `decide` (or `fallback`) exactly once a period of the description. A program that calls it more often or
+        more rarely executes other plans than the predicted ones, so the filter widens its sets.
 
         Args:
             state: (n,) measured, in the order and the units of the robot's description (`Robot.state`).
             action: (m,) proposed, in the order and the units of the description (`Robot.action`). If it holds NaN or
                 infinity, the decision is a failsafe.
-            obstacles: at least those within the robot's `sight` of the measured position (1 m for `ground`), and the
-                moving ones that may come so near before a plan ends.
+            obstacles: in the frame of the state's position; at least those within the robot's `sight` of the measured
+                position (1 m for `ground`), and the moving ones that may come so near before a plan ends.
             scan: a sensor's measurement, instead of obstacles or in addition: a `Scan`, or a `RangeImage` in space.
                 Fill it in with `brakeline.filled` first.
             observation: the task's observation. Only the rivals read it.

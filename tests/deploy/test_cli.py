@@ -426,6 +426,10 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
     status, _, err = command("robot", "new", path)
     assert status == 1 and "exists" in err
     new = path.read_text()
+    (remark,) = figures("robot", "check", path)["remarks"]
+    assert remark.startswith("body: one disc of 0.2 m around the position, as in the template."), "nobody measured it"
+    path.write_text(new.replace("radius = 0.2", "radius = 0.3"))
+    assert not figures("robot", "check", path)["remarks"]
     path.write_text(new.replace("sight = 3.0", "sight = 0.2"))
     assert any(remark.startswith("sight") for remark in figures("robot", "check", path)["remarks"])
     limit = '\n[[limit]]\nname = "{}"\nweights = {{ speed = {} }}\nmost = {}\n'
@@ -460,6 +464,18 @@ def test_show_prints_a_description(command, figures, robot):
     assert shown["horizon"] == {"ground": 3, "quadrotor": 12}[robot]
     out = command("robot", "show", robot)[1]
     assert "[m/s]" in out and "layout" in out and shown["way_to_a_stop_m"] > 0.0
+
+
+def test_show_prints_how_far_the_body_reaches_from_the_position(command, figures, tmp_path):
+    """An odometry's point ahead of the middle, with the discs behind it or ahead of it, looked the same."""
+    path = tmp_path / "cart.toml"
+    assert command("robot", "new", path)[0] == 0
+    path.write_text(path.read_text().replace("at = [0.0, 0.0]", "at = [0.4, -0.1]"))
+    shown = figures("robot", "show", path)
+    reach = [shown[f"body_{side}_m"] for side in ("ahead", "behind", "to_the_left", "to_the_right")]
+    np.testing.assert_allclose(reach, [0.6, -0.2, 0.1, 0.3], atol=1e-12)
+    assert "body to the left [m]" in command("robot", "show", path)[1]
+    assert "body_ahead_m" not in figures("robot", "show", "quadrotor")
 
 
 def test_the_way_to_a_stop_is_not_known_if_no_input_is_a_speed(command, figures):

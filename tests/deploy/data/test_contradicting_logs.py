@@ -290,6 +290,37 @@ def test_a_period_that_is_not_the_controllers_is_noted(driven, tmp_path, capsys,
     assert ("inputs change at multiples of 0.1 s" in text and "write `period = 0.1`" in text) == noted, (status, text)
 
 
+def test_a_period_below_the_delay_is_not_proposed(driven, tmp_path, capsys):
+    """One note said to write a period of 0.1 s, and the next one that predictions need a longer one than that."""
+    held = driven[1].copy()
+    late(held, [X, Y, HEADING, V, W], PERIOD - 2)
+    status, text = imported(write_csv(tmp_path / "drive.csv", driven[0], held), capsys)
+    assert status == 0 and "keep that period, because the delay is longer than 0.1 s" in text, (status, text)
+    assert "hold each input for 0.2 s" in text and "write `period" not in text
+
+
+def test_a_period_is_not_proposed_to_itself(driven, tmp_path, capsys):
+    """Of changes that a log shows late: "multiples of 0.1 s, but the description's period is 0.1 s"."""
+    rng, robot = np.random.default_rng(3), tmp_path / "porter.toml"
+    robot.write_text(FILE.read_text().replace("period = 0.2", "period = 0.1"))
+    held = driven[1].copy()
+    for k in range(5, len(held), 5):  # the joystick speaks every five rows
+        if rng.random() < 0.2:
+            held[k, [SPEED, TURN]] = driven[1][k - 1, [SPEED, TURN]]
+    status, text = imported(write_csv(tmp_path / "drive.csv", driven[0], held), capsys, robot=robot)
+    assert "of the periods an input changed" in text and "multiples of 0.1 s" not in text, (status, text)
+
+
+def test_a_converted_column_is_in_si_whatever_its_name_says(driven, tmp_path, capsys):
+    values = driven[1].copy()
+    values[:, HEADING] = np.degrees(values[:, HEADING])
+    path, robot = write_csv(tmp_path / "drive.csv", driven[0], values), tmp_path / "my.toml"
+    path.write_text(path.read_text().replace("heading", "yaw_deg", 1))
+    assert main(["robot", "new", str(robot), "--from", str(path), "--unit", "yaw_deg=deg"]) == 0
+    note = "Requests and decisions have yaw_deg in rad, whatever its name says"
+    assert note in " ".join(capsys.readouterr().out.split()) and note in robot.read_text()
+
+
 def test_an_error_below_the_noise_at_rest_is_noted(tmp_path, capsys):
     """The porter's positions are measured within 4 mm."""
     rng = np.random.default_rng(1)

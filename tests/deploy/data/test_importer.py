@@ -439,6 +439,8 @@ def test_the_report_says_what_is_missing_and_draws_it(tmp_path, figures):
     missing = said["coverage"]["missing"]
     assert "speed never above 0.3 m/s (bound 0.6): record this" in missing
     assert any(text.startswith("no braking above 0.3 m/s of speed") for text in missing), missing
+    (few,) = (text for text in missing if "plans of 5 periods that do not overlap" in text)
+    assert few.startswith("at most 199 plans") and "the limit is 1 %: record 5 more minutes like these" in few
     assert picture.read_bytes().startswith(b"\x89PNG") and said["coverage"]["stops"] > 5
     assert Dataset.load(out).digest() == said["digest"]
 

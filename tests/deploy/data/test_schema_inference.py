@@ -97,6 +97,18 @@ def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
         )
 
 
+def test_a_new_description_says_what_to_do_about_a_delay_above_one_period(driven, tmp_path, capsys):
+    """Otherwise `certify`, minutes later, says that the sets are wide."""
+    for rows, said in ((0, False), (12, True)):  # a joystick of 0.1 s, and a robot that is another 0.24 s late
+        values = driven[1].copy()
+        values[rows:, :5] = driven[1][: len(values) - rows, :5]
+        path, robot = write_csv(tmp_path / f"drive{rows}.csv", driven[0], values), tmp_path / f"my{rows}.toml"
+        assert main(["robot", "new", str(robot), "--from", str(path)]) == 0
+        text = " ".join(capsys.readouterr().out.split())
+        assert ("predictions use one earlier input only" in text) == said, text
+        assert ("The file then has `period = 0.3`" in text or "The file then has `period = 0.4`" in text) == said, text
+
+
 def test_a_delay_of_one_period_is_one_period_but_for_rounding():
     follower = InferredColumn("v", "m/s", 0.0, 1.0, follows="speed", delay=math.nextafter(0.1, 1.0))
     assert brake_periods(0.1, [follower], []) == (1, 1)
