@@ -48,6 +48,7 @@ class PredictiveConfig:
 
     lag: float = 0.05  # s, the time constant of the speeds
     margin: float = 0.02  # m, tuned
+    soft: float = 0.0  # 1: inside the margin, a plan must only come no nearer than the last one
 
 
 RivalConfig = SecasConfig | SailrConfig | BarrierConfig | VelocityBarrierConfig | PredictiveConfig

@@ -13,9 +13,9 @@ inputs by a first-order lag of time constant τ; the model is a unicycle, or a v
 Sequential quadratic programming solves it. Each program linearises the predicted positions in the inputs, and each
 distance at its closest point. The first attempt starts at the proposal, the second one at the last plan, the third one
 at standing. Without a solution, the robot follows its last plan, as in the article. The model is nominal, so the margin
-alone allows for its error. The stochastic and robust versions in the article tighten constraints instead. The margin is
-soft: where errors have brought the robot nearer than the margin, a plan must only come no nearer than the last one.
-With a hard margin, a robot that stands a millimetre inside it would have no plan any more, not even to turn away.
+alone allows for its error. The stochastic and robust versions in the article tighten constraints instead. With a hard
+margin, a robot that stands a millimetre inside it has no plan any more, not even one that turns away. With the setting
+`soft` of 1, a plan must there only come no nearer than the last one.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ from brakeline.safety.rivals.model_by_hand import RivalByHand, follows_velocitie
 from brakeline.safety.rivals.pretrained import Pretrained
 
 SETTINGS = ("lag", "margin")  # τ [s], margin around obstacles [m]
+SOFT = "soft"  # optional: the share of a violation of the margin by the last plan that the next one may repeat
 SAMPLES = 4  # of a period
 STANDING = 4.0  # time constants after the first zero input until the robot counts as standing
 ITERATIONS = 5  # quadratic programs from one start
 CONVERGED = 1e-4  # of an input's range
 LEAST_SLOPE = 1e-4  # m for an input's whole range: rows with smaller gradients are left out
-ACCURACY = 1e-5  # m: a constraint violated by less is met
+ACCURACY = 1e-4  # m: a constraint violated by less is met
+ACCURACY_OF_SOFT = 1e-5  # m: so little that an episode of such errors leads no nearer
 LATER = 1e-2  # weight of later inputs in the cost; that of the first one is 1
 STEP = 1e-4  # of an input's range, for derivatives
 
@@ -54,15 +56,18 @@ class PredictiveFilter(RivalByHand):
         self._scale, self._free = robot.high() - robot.low(), robot.horizon - 1
         stopping = math.ceil(STANDING * self.settings["lag"] / robot.period)
         self._after = np.zeros((stopping - 1, robot.action_dim))  # inputs after the plan, until the robot stands
+        self._soft = model.settings.get(SOFT, 0.0)
+        self._accuracy = ACCURACY_OF_SOFT if self._soft else ACCURACY
         self._cost = np.tile([1.0, *[LATER] * (self._free - 1)], (robot.action_dim, 1)).T.ravel()
 
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
         """Return the closest plan of the nominal model that is clear; without one, go on with the last plan."""
         wanted = braking_plan(self.robot, proposal)
         margin = self.settings["margin"]
-        margin += min(self._room(request, request.plan, margin), 0.0)
+        if self._soft:
+            margin += self._soft * min(self._room(request, request.plan, margin), 0.0)
         room = self._room(request, wanted, margin)
-        if room >= -ACCURACY:
+        if room >= -self._accuracy:
             return self.decision(ALLOWED, wanted, room, started)
         starts = (wanted, request.plan, np.zeros_like(request.plan))
         solved = (self._solve(request, proposal, start, margin) for start in starts)
@@ -118,7 +123,7 @@ class PredictiveFilter(RivalByHand):
             if moved < CONVERGED:
                 break
         plan = self._plan(z, request.input_in_force)
-        return plan if self._room(request, plan, margin) >= -ACCURACY else None
+        return plan if self._room(request, plan, margin) >= -self._accuracy else None
 
     def _limits(self, before: Array) -> tuple[Array, Array]:
         """Return the bounds and the slew as rows A z <= b. before: the input in force."""
