@@ -208,7 +208,8 @@ def test_the_page_of_the_ground_robot_says_how_many_steps_sac_needs_at_both_lear
 
 OTHERS = {  # rows of the table of other settings, with the folder and the method of their cells
     "TD3, 300,000 steps": ("plateau/quadrotor", "none"),
-    "SAILR, η = 0.15, 300,000 steps": ("plateau/quadrotor", "sailr"),
+    "SAILR, 300,000 steps": ("plateau/quadrotor", "sailr"),
+    "SAILR, η = 0.15, 300,000 steps": ("former_plateau/quadrotor", "sailr"),
     "SECAS, 300,000 steps": ("plateau/quadrotor", "secas"),
     "PSF, 300,000 steps": ("plateau/quadrotor", "psf"),
     "TD3-Lagrange, 300,000 steps": ("plateau/quadrotor", "lagrange"),
