@@ -359,7 +359,7 @@ THREATS = """## Threats to validity
 - **SAC.** If *SAC* and *SAC, our filter* have different learning rates (see *Setup*), their rows differ in more than
   the filter.
 - **Robots at once.** There are 16, so that the first episodes, which begin together, do not hide how few steps a method
-  needs. On the ground, PSF reached more goals with 64 at once (`docs/results_ground.md`).
+  needs.
 - **Rooms.** The trainings that chose penalty, its growth, imitation and turning aside were evaluated in rooms of the
   tables (the first 200 or all 500 of an arena), and the rivals' values in other rooms. This favours ours. The campaigns
   (`docs/campaigns.md`) drive the stored policies in 10,000 rooms of each arena, which contain these 500.
