@@ -14,8 +14,8 @@ Sequential quadratic programming solves it. Each program linearises the predicte
 distance at its closest point. The first attempt starts at the proposal, the second one at the last plan, the third one
 at standing. Without a solution, the robot follows its last plan, as in the article. The model is nominal, so the margin
 alone allows for its error. The stochastic and robust versions in the article tighten constraints instead. With a hard
-margin, a robot that stands a millimetre inside it has no plan any more, not even one that turns away. With the setting
-`soft` of 1, a plan must there only come no nearer than the last one.
+margin, a robot that stands a millimetre inside it has no plan any more, not even one that turns away. With a soft
+margin (`soft` is 1), a plan of a robot inside it only has to come no nearer than the last plan.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import math
 
 import numpy as np
 
+from brakeline.errors import BadModel
 from brakeline.messaging.robot import Array
 from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
@@ -33,14 +34,14 @@ from brakeline.safety.rivals.model_by_hand import RivalByHand, follows_velocitie
 from brakeline.safety.rivals.pretrained import Pretrained
 
 SETTINGS = ("lag", "margin")  # τ [s], margin around obstacles [m]
-SOFT = "soft"  # optional: the share of a violation of the margin by the last plan that the next one may repeat
+SOFT = "soft"  # optional, 0 to 1: share of the last plan's violation of the margin that the next plan may repeat
 SAMPLES = 4  # of a period
 STANDING = 4.0  # time constants after the first zero input until the robot counts as standing
 ITERATIONS = 5  # quadratic programs from one start
 CONVERGED = 1e-4  # of an input's range
 LEAST_SLOPE = 1e-4  # m for an input's whole range: rows with smaller gradients are left out
 ACCURACY = 1e-4  # m: a constraint violated by less is met
-ACCURACY_OF_SOFT = 1e-5  # m: so little that an episode of such errors leads no nearer
+ACCURACY_OF_SOFT = 1e-5  # m: smaller, because the errors of an episode's steps can add up
 LATER = 1e-2  # weight of later inputs in the cost; that of the first one is 1
 STEP = 1e-4  # of an input's range, for derivatives
 
@@ -49,7 +50,7 @@ class PredictiveFilter(RivalByHand):
     """The predictive safety filter as a method of the comparison."""
 
     def __init__(self, model: Pretrained) -> None:
-        """Make the method. Raises BadModel: the model is of another method, or does not fit the robot."""
+        """Make the method. Raises BadModel: the model is of another method, or does not fit."""
         fits = is_unicycle(model.robot) or follows_velocities(model.robot)
         super().__init__(model, PSF, SETTINGS, fits, "speed and turn rate, or velocities")
         robot = self.robot
@@ -57,6 +58,8 @@ class PredictiveFilter(RivalByHand):
         stopping = math.ceil(STANDING * self.settings["lag"] / robot.period)
         self._after = np.zeros((stopping - 1, robot.action_dim))  # inputs after the plan, until the robot stands
         self._soft = model.settings.get(SOFT, 0.0)
+        if not 0.0 <= self._soft <= 1.0:
+            raise BadModel(f"soft is {self._soft:g}: give 0 for a hard margin, 1 for a soft one, or a number between")
         self._accuracy = ACCURACY_OF_SOFT if self._soft else ACCURACY
         self._cost = np.tile([1.0, *[LATER] * (self._free - 1)], (robot.action_dim, 1)).T.ravel()
 

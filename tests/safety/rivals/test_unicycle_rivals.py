@@ -89,7 +89,14 @@ def test_a_robot_that_stands_inside_a_soft_margin_may_turn_and_drive_away(wanted
     inside = request(obstacles=[wall(0.105 + 0.01 - 0.001)], action=wanted)
     decision = SOFT.decide(inside)
     assert decision.kind == kind and decision.plan[0, 0] <= 1e-4
-    assert PREDICTIVE.decide(inside).kind in (FAILSAFE, kind)
+    assert PREDICTIVE.decide(inside).kind == FAILSAFE
+
+
+@pytest.mark.parametrize("soft", [-0.1, 1.1, np.nan])
+def test_a_softness_outside_0_to_1_is_refused(soft):
+    """Above 1, each plan could come nearer than the last one."""
+    with pytest.raises(BadModel, match="soft is"):
+        PredictiveFilter(replace(SOFT.model, settings=SOFT.model.settings | {"soft": soft}))
 
 
 @pytest.mark.parametrize("method", [BARRIER, PREDICTIVE])
