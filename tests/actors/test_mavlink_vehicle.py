@@ -56,13 +56,17 @@ def shared_flight(request: pytest.FixtureRequest) -> Iterator[Flying]:
 def flying(shared_flight: Flying) -> Flying:
     """Return a vehicle that hovers: the tests share one flight of each autopilot."""
     vehicle, _, frames = shared_flight
-    until(lambda: vehicle.idle and speed(vehicle) < 0.3 and not vehicle.current_period.lost, "hovering", 20.0)
+    until_it_hovers(vehicle)
     frames.clear()
     return shared_flight
 
 
 def speed(vehicle: MavlinkVehicle) -> float:
     return float(np.linalg.norm(vehicle.current_period.report.measured[3:6]))
+
+
+def until_it_hovers(vehicle: MavlinkVehicle) -> None:
+    until(lambda: vehicle.idle and speed(vehicle) < 0.3 and not vehicle.current_period.lost, "hovering", 20.0)
 
 
 of_one_autopilot = pytest.mark.parametrize("shared_flight", RULES[:1], indirect=True)
@@ -129,14 +133,24 @@ def test_the_autopilot_brakes_when_the_link_dies() -> None:
         until(lambda: np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1, "it brakes", 4.0)
 
 
-def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flying) -> None:
+def flown(flying: Flying, plan: np.ndarray, count: int) -> np.ndarray:
+    """Fly a plan, and return the inputs (count, 3) of as many periods; again, if a stalled machine missed one."""
     vehicle, _, frames = flying
-    plan = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]])
-    number = vehicle.current_period.number + 2
-    assert vehicle.commit(plan, number)
-    periods = [vehicle.wait(number + k) for k in range(6)]
-    assert [current.number - number for current in periods] == [0, 1, 2, 3, 4, 5], "the test saw every period"
-    assert np.array([current.input for current in periods]) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
+    for _ in range(5):
+        until_it_hovers(vehicle)
+        frames.clear()
+        number = vehicle.current_period.number + 2
+        if not vehicle.commit(plan, number):
+            continue  # the machine stalled before the commit
+        periods = [vehicle.wait(number + k) for k in range(count)]
+        if [current.number - number for current in periods] == list(range(count)):
+            return np.array([current.input for current in periods])
+    raise AssertionError("the machine missed periods in each of five flights")
+
+
+def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flying) -> None:
+    plan, (_, _, frames) = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]]), flying
+    assert flown(flying, plan, 6) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
 
 
@@ -144,10 +158,8 @@ def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flyi
 def test_inputs_keep_to_the_robots_slew(flying: Flying, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, _, _ = flying
     monkeypatch.setattr(vehicle, "_robot", replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2)))
-    number = vehicle.current_period.number + 2
-    assert vehicle.commit(np.tile([1.0, 0.0, 0.0], (3, 1)), number)
-    inputs = [vehicle.wait(number + k).input[0] for k in range(5)]
-    assert inputs == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
+    inputs = flown(flying, np.tile([1.0, 0.0, 0.0], (3, 1)), 5)
+    assert inputs[:, 0] == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
 
 
 @of_one_autopilot
