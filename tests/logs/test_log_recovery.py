@@ -171,10 +171,10 @@ def test_killed_at_five_random_moments_nothing_older_than_a_second_is_missing(
     for folder, after in sorted(((f, chance.uniform(0.2, 2.2)) for f in folders), key=lambda item: item[1]):
         while time.monotonic() < begin + after:
             publisher.put(pb.Step(observation=[chance.random() for _ in range(26)]))
-            dated.append(time.time())
+            dated.append(time.monotonic())
             time.sleep(0.002)
         children[folder].kill()
-        killed[folder] = time.time()
+        killed[folder] = time.monotonic()
     for folder, child in children.items():
         child.wait()
         found: list[int] = []
