@@ -85,8 +85,8 @@ def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float]
         assert autopilot.flight.armed and autopilot.flight.mode is Mode.OFFBOARD
         for _ in range(12):
             period = vehicle.step(np.array([2.0, 1.0, 0.0]))
-        assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
         late = 3.0 * stalled()  # m flown meanwhile: the ground truth is older, by a stall at most
+        assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3 + late)  # after a stall, it brakes
         assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3 + late)
         assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
         assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.current_period.lost and not period.collision
@@ -166,13 +166,18 @@ def test_inputs_keep_to_the_robots_slew(flying: Flying, monkeypatch: pytest.Monk
 def test_a_late_plan_does_not_count_and_a_newer_one_does(flying: Flying) -> None:
     vehicle, _, _ = flying
     first, second = np.full((3, 3), 0.3), np.full((3, 3), 0.6)
-    number = vehicle.current_period.number + 2
-    assert vehicle.commit(first, number)
-    vehicle.wait(number)
-    assert not vehicle.commit(second, number), "the period has begun"
-    assert vehicle.current_period.input == pytest.approx(first[0])
-    assert vehicle.commit(second, number + 1)
-    assert vehicle.wait(number + 1).input == pytest.approx(second[0])
+    for _ in range(5):  # a machine that stalls may miss the next period
+        until_it_hovers(vehicle)
+        number = vehicle.current_period.number + 2
+        if not vehicle.commit(first, number) or vehicle.wait(number).number != number:
+            continue
+        assert not vehicle.commit(second, number), "the period has begun"
+        assert vehicle.current_period.input == pytest.approx(first[0])
+        if vehicle.commit(second, number + 1) and (after := vehicle.wait(number + 1)).number == number + 1:
+            assert after.input == pytest.approx(second[0])
+            break
+    else:
+        raise AssertionError("the machine missed a period in each of five flights")
     with pytest.raises(BadInput):
         vehicle.commit(np.full((2, 3), np.nan), number + 4)
 
