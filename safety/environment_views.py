@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
 from brakeline.errors import Mismatch
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.scan import Scan
 
 # (environment, observation, info) -> the state or the obstacles
 View = Callable[[Any, Any, dict[str, Any]], Any]
@@ -42,7 +45,7 @@ STATE, OBSTACLES = in_info("state"), _obstacles
 
 
 def copied(value: Any) -> Any:
-    """Return an observation or an info with copies of its arrays and lists: a policy may overwrite those it gets."""
+    """Return an observation or an info with copies of its arrays, lists and scans: a policy may overwrite them."""
     if isinstance(value, np.ndarray):
         whole = value.copy()
         if value.dtype.hasobject:  # such as a list of obstacles for each environment
@@ -51,6 +54,8 @@ def copied(value: Any) -> Any:
         return whole
     if isinstance(value, dict):
         return {name: copied(part) for name, part in value.items()}
+    if isinstance(value, Scan | RangeImage):
+        return deepcopy(value)
     if type(value) is list:
         return value.copy()  # not its parts: it may hold thousands of numbers
     return tuple(map(copied, value)) if type(value) is tuple else value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from numbers import Integral
 from types import SimpleNamespace
 from typing import Any
@@ -219,6 +220,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         rng = np.random.default_rng((self.seed_key, episode))
         arena = self._draw(name, rng, self.robot)
         self.arena_name, self._episode_seed, self._arena = name, episode, arena
+        self._shapes = deepcopy(arena.shapes)  # a policy may overwrite those of the arena in its info
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)
@@ -319,7 +321,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             scan["scan"] = self._scanner.scan(period.true, period.measured, self._time)
         else:
             position = period.measured[: self.robot.position_dim]
-            near = self._arena.shapes.distance(position) <= self.robot.sight
+            near = self._shapes.distance(position) <= self.robot.sight
             obstacles = [self._arena.obstacles[i] for i in np.flatnonzero(near)] + self._moving_obstacles(position)
         return {
             "robot": self.robot.name,

@@ -8,6 +8,8 @@ import pytest
 from brakeline.deploy.policy_loading import file_named, network_named, policy_hash, policy_named
 from brakeline.errors import BadInput, UnknownTask
 from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.scan import Scan
 from brakeline.messaging.task import robot_with_task, with_task
 
 GROUND = robot_with_task("ground")
@@ -28,6 +30,12 @@ def test_a_folder_without_a_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no policy of ground: name the folder of a training"):
         network_named(str(tmp_path), GROUND, 0)
 
+
+ERASER = """
+def erase(observation, info):
+    info["scan"].ranges[:] = 3.5
+    return [0.1, 0.2]
+"""
 
 AGENT = """
 class Agent:
@@ -94,6 +102,16 @@ def test_a_policy_of_your_own_that_overwrites_what_it_gets_changes_no_request(tm
     policy_named("agent.py:greedy", GROUND, 0)(observation, info)
     assert observation.all() and observation.max() == 1.0
     assert info["state"].all() and info["obstacles"] == ["a post"]
+
+
+def test_a_policy_of_your_own_that_overwrites_its_scan_frees_no_space(tmp_path, monkeypatch):
+    (tmp_path / "eraser.py").write_text(ERASER)
+    monkeypatch.chdir(tmp_path)
+    scan = Scan(ranges=np.full(9, 0.4), angles=np.linspace(-1.0, 1.0, 9), pose=(0.0, 0.0, 0.0))
+    image = RangeImage(np.full((20, 40), 0.4), (0.0, 0.0, 0.0))
+    for sensed in (scan, image):
+        policy_named("eraser.py:erase", GROUND, 0)(np.ones(3, np.float32), {"scan": sensed})
+        assert sensed.ranges.max() == 0.4
 
 
 def test_neither_does_a_policy_that_a_task_names(tmp_path):

@@ -206,6 +206,15 @@ def test_a_reset_can_change_the_arena_and_its_seed_determines_the_sequence_of_ep
 
 
 @each_robot
+def test_a_policy_that_moves_the_arenas_shapes_away_frees_no_space(make: Make) -> None:
+    env, sound = make(), make()
+    env.reset(options={"episode_seed": 1})[1]["arena"].shapes.center[:] += 1000.0
+    sound.reset(options={"episode_seed": 1})
+    inputs = np.zeros(env.robot.action_dim)
+    assert env.step(inputs)[4]["obstacles"] == sound.step(inputs)[4]["obstacles"] != []
+
+
+@each_robot
 def test_info_has_its_documented_keys_and_values(make: Make) -> None:
     env = make()
     robot, d = env.robot, env.robot.position_dim
