@@ -346,6 +346,7 @@ def test_an_invalid_batch_is_refused_with_the_fields_name():
         ("state", {"state": arrays.state[:, :4]}),
         ("plan", {"plan": arrays.plan[:3]}),
         ("obstacles.margin", {"obstacles": replace(around, margin=around.margin[:, :0])}),
+        ("obstacles.count", {"obstacles": replace(around, count=around.count.astype(np.uint8))}),
         ("obstacles.count", {"obstacles": replace(around, count=around.count + 9)}),
         ("model", {"model": ["a"]}),
         ("state", {"state": arrays.state.astype(np.float32)}),

@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -230,6 +231,31 @@ def test_a_state_that_is_not_possible_costs_its_robot_one_period(value: float) -
     N = plans.robot.horizon
     assert given[N : 6 + N] == [[True] * 3] * (6 - N) + [[True, False, True]] * N and given[6 + N] == [True] * 3
     assert plans.widening.tolist() == [alone.widening[0], plans.widening[1], alone.widening[1]]
+
+
+@pytest.mark.parametrize("changes", [{"margin": math.nan}, {"rho": -0.1}, {"center": 1e300}, {"axes": 2.0}])
+def test_an_obstacle_that_is_not_possible_costs_its_robot_alone_the_decision(changes: dict[str, float]) -> None:
+    """That robot brakes along its plan, although nothing valid is known around it."""
+    safety, post = one_step(), Shapes.of([Obstacle("cylinder", (0.9, 0.0), (0.1,))], 2)
+    plans, alone = BackupPlanBatch(safety, 2), BackupPlanBatch(safety, 1)
+    around, own, states = ObstacleArrays.of([post] * 2), ObstacleArrays.of([post]), np.zeros((2, 5))
+    for period in range(4):
+        damaged = {name: getattr(around, name).copy() for name in changes}
+        for name, value in changes.items():
+            damaged[name][0] = value
+        now = replace(around, **damaged) if period == 2 else around
+        outcome = plans.decide(states, np.tile([0.2, 0.0], (2, 1)), now)
+        assert outcome.decided.tolist() == [period != 2, True] and bool(outcome.failure) == (period == 2)
+        assert np.array_equal(outcome.inputs[1:], alone.decide(states[1:], np.array([[0.2, 0.0]]), own).inputs)
+        if period == 2:
+            assert outcome.answers is not None and outcome.answers.verified.tolist() == [False, True]
+            assert outcome.answers.row(0).kind == FAILSAFE and outcome.inputs[0, 0] < 0.2
+
+
+def test_obstacles_of_another_number_of_robots_are_refused_also_beside_an_invalid_state() -> None:
+    plans, free = BackupPlanBatch(SAFETY, 2), ObstacleArrays.of([Shapes.of([], 2)] * 3)
+    outcome = plans.decide(np.array([[math.nan] * 5, [0.0] * 5]), np.tile([0.2, 0.0], (2, 1)), free)
+    assert not outcome.decided.any() and "obstacles" in outcome.failure and not outcome.inputs.any()
 
 
 def test_an_observation_that_is_not_finite_costs_its_robot_alone_a_rivals_decision() -> None:

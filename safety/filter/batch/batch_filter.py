@@ -102,7 +102,9 @@ def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:
         if kind in types and value.dtype != types[kind]:
             raise BadRequest(name, f"{name} has the type {value.dtype}, not {'float64' if kind == 'f' else 'bool'}")
     counts = on_host(requests.obstacles.count)
-    if counts.size and not (counts.dtype.kind == "i" and counts.min() >= 0 and counts.max() <= K):
+    if counts.dtype.kind != "i":
+        raise BadRequest("obstacles.count", f"obstacles.count has the type {counts.dtype}, not int64")
+    if counts.size and not (counts.min() >= 0 and counts.max() <= K):
         raise BadRequest("obstacles.count", f"obstacles.count holds integers from 0 to {K}, the number of slots")
     if not isinstance(requests.model, str) and len(requests.model) != B:
         raise BadRequest("model", f"model has {len(requests.model)} versions, a batch of {B} requests has {B}")

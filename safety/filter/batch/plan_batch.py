@@ -19,7 +19,7 @@ from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
 from brakeline.safety.filter.batch.decision_arrays import KINDS, DecisionArrays
-from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, mapped
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, mapped, plausible
 from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionArrays, RequestArrays
 from brakeline.safety.filter.request import FAILSAFE
 from brakeline.safety.filter.widening import WINDOWS, widening_factor
@@ -33,7 +33,7 @@ Observations = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 SAME_INPUT = 1e-9  # rounding allowed in a plan at the bounds of its inputs
-NO_DECISION = "a state or observation that is not finite or too large, or a plan that is not possible"
+NO_DECISION = "a state, observation or obstacle that is not finite or too large, or a plan that is not possible"
 STANDING, VERIFIED, OPEN = range(3)  # of a committed plan: it stands, the model set verified it, nothing did
 
 
@@ -152,7 +152,10 @@ class BackupPlanBatch:
             usable &= np.isfinite(observations).all(axis=1)
             observations = np.where(usable[:, None], observations, np.float32(0.0))
         # One row that is not valid would cost all others their decisions: it gets valid values, and no decision.
+        usable &= _plausible_obstacles(obstacles, self._size)
         measured = np.where(usable[:, None], states, 0.0)
+        if obstacles.count.shape == usable.shape:
+            obstacles = replace(obstacles, count=np.where(usable, obstacles.count, 0))
         try:
             answers = self.safety.decide_batch(self.request(measured, actions, obstacles, observations))
         except (BadRequest, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -252,6 +255,14 @@ class BackupPlanBatch:
 def _plausible(states: Array) -> Flags:
     """Return which measured states (B, n) a request may hold."""
     return np.asarray((np.abs(states) <= FARTHEST).all(axis=1))  # NaN fails too
+
+
+def _plausible_obstacles(obstacles: ObstacleArrays, size: int) -> Flags:
+    """Return which robots (B,) have obstacles of possible numbers. Of arrays that do not fit, the batch is refused."""
+    if obstacles.count.shape != (size,) or obstacles.rho.shape[:1] != (size,):
+        return np.ones(size, dtype=bool)
+    with np.errstate(all="ignore"):
+        return np.asarray(plausible(np, obstacles))
 
 
 def _precise(array: Array) -> Array:
