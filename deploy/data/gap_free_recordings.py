@@ -84,14 +84,15 @@ def gap_free_recordings(
             part = [_within(series, begin, end) for series in states]
             if all(len(time) >= 2 for time, _ in part):
                 recordings.append(GapFreeRecording(part, inputs, begin, end))
-    counts = {"gaps in the stamps: the recording is cut there": gaps, "jumps of the pose": jumps}
-    counts["times an input changed while messages of it are missing: the recording is cut there"] = lost
-    counts[
-        f"times no message of an input came for longer than {hold:g} s: the time after that is left out. If the robot "
-        "keeps an input until the next message, give a larger --hold"
-    ] = silent
-    counts["rows with the stamp of the row before and another pose: left out"] = shared
-    return recordings, [f"{count} {what}" for what, count in counts.items() if count]
+    counts = {
+        "gaps in the stamps, at which the recording is cut: {}": gaps,
+        "jumps of the pose, at which the recording is cut: {}": jumps,
+        "changes of an input beside missing messages of it, at which the recording is cut: {}": lost,
+        f"times without a message of an input for longer than {hold:g} s: {{}}; the rest of each is left out. If the "
+        "robot keeps an input until the next message, give a larger --hold": silent,
+        "rows with the stamp of the row before and another pose, which are left out: {}": shared,
+    }
+    return recordings, [note.format(count) for note, count in counts.items() if count]
 
 
 def _gaps(time: Array, period: float, name: str) -> Indices:

@@ -39,6 +39,7 @@ READERS = {
     ".ulg": "px4_log:read",
 }
 KINDS = f"{', '.join(READERS)}, .mcap (a bag, or a log of a run), and folders of bags, of Parquet files and of runs"
+MOST_NAMES = 3  # of sources before a note
 MOST_STEPS = 1_000_000  # of a log of a run; an import takes the last ones
 
 
@@ -147,13 +148,27 @@ def import_sources(
         chord_deviation=data.chord_deviation,
         delays={name: seconds for report in reports for name, seconds in report.delays.items()},
         uneven=sum(report.uneven * report.periods for report in reports) / data.periods,
-        notes=tuple(
-            note if len(paths) == 1 or path.name in note else f"{path.name}: {note}"
-            for path, report in zip(paths, reports, strict=True)
-            for note in report.notes
-        ),
+        notes=_notes_by_source(paths, reports),
     )
     return ImportedData(data, report)
+
+
+def _notes_by_source(paths: Sequence[Path], reports: Sequence[ImportReport]) -> tuple[str, ...]:
+    """Return all notes, each once, after the names of its sources if there are several."""
+    sources: dict[str, list[str]] = {}
+    for path, report in zip(paths, reports, strict=True):
+        for note in report.notes:
+            sources.setdefault(note, []).append(path.name)
+
+    def after_names(note: str, names: list[str]) -> str:
+        if len(paths) == 1 or names[0] in note:
+            return note
+        if len(names) == len(paths):
+            return f"all files: {note}"
+        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+        return f"{', '.join(names[:MOST_NAMES])}{more}: {note}"
+
+    return tuple(after_names(note, names) for note, names in sources.items())
 
 
 def _refuse_options(options: LogOptions, delay: float, hold: float) -> None:

@@ -129,6 +129,19 @@ def test_a_recording_counts_once_under_whatever_name(driven, from_csv, tmp_path)
     assert import_sources([one, other], porter()).data.periods > 1.9 * from_csv.periods
 
 
+def test_a_note_on_several_files_is_said_once(tmp_path):
+    paths = []
+    for seed in range(5):
+        time, values = drive(seconds=20.0, seed=seed)
+        kept = np.ones(len(time), dtype=bool) if seed == 4 else (time < 8.0) | (time > 11.0)
+        paths.append(write_csv(tmp_path / f"{seed}.csv", time[kept], values[kept]))
+    said = "gaps in the stamps, at which the recording is cut: 1"
+    for some, names in ((paths[:2], "all files"), (paths[1:], "1.csv, 2.csv, 3.csv"), (paths[:1], "")):
+        notes = [note for note in import_sources(some, porter()).report.notes if "gaps" in note]
+        assert notes == [f"{names}: {said}" if names else said]
+    assert f"0.csv, 1.csv, 2.csv and 1 more: {said}" in import_sources(paths, porter()).report.notes
+
+
 def test_a_part_of_a_recording_and_a_later_copy_count_as_copies_too(driven):
     time, values = driven
     whole, part = (
@@ -230,7 +243,7 @@ def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     assert lengths(resample([table(time[kept], values[kept])], porter(), LogOptions())) == [28, 68]
     jumped = values + np.where(np.arange(101)[:, None] >= 40, [2.0, 0, 0, 0, 0, 0, 0], 0.0)
     made = resample([table(time, jumped)], porter(), LogOptions())
-    assert lengths(made) == [38, 59] and "1 jumps of the pose" in made.report.notes
+    assert lengths(made) == [38, 59] and "jumps of the pose, at which the recording is cut: 1" in made.report.notes
     twice = (
         np.r_[time, time],
         np.vstack([values, values + np.eye(7)[0]]),
@@ -270,7 +283,7 @@ def test_cut_where_a_message_of_an_input_that_changes_is_lost():
     given[70:80, 0] = 0.3
     whole = resample([with_messages(given)], porter(), LogOptions())
     cut = resample([with_messages(given, lost=[30, 75])], porter(), LogOptions())
-    note = "1 times an input changed while messages of it are missing: the recording is cut there"
+    note = "changes of an input beside missing messages of it, at which the recording is cut: 1"
     assert lengths(whole) == [99] and lengths(cut) == [29, 68] and note in cut.report.notes
     of_all, left = (np.vstack([t.inputs for t in made.data.trajectories]) for made in (whole, cut))
     assert np.allclose(left, np.delete(of_all, [29, 30], axis=0))
@@ -305,7 +318,8 @@ def test_a_robot_that_is_put_back_every_few_seconds_is_one_robot():
 def test_rows_with_the_same_stamp_are_named(driven):
     time, values = driven[0][:2000], driven[1][:2000]
     made = resample([table(np.floor(time * 10.0 + 1e-6) / 10.0, values)], porter(), LogOptions())
-    assert any("rows with the stamp of the row before and another pose: left out" in note for note in made.report.notes)
+    said = "rows with the stamp of the row before and another pose, which are left out: "
+    assert any(said in note for note in made.report.notes)
 
 
 def test_angles_are_unwrapped_before_they_are_looked_at_in_between():
@@ -320,11 +334,11 @@ def test_an_input_is_held_and_forgotten_after_a_while():
     values[20:40, 5:] = np.nan  # nobody spoke for 4 s
     made = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
     assert lengths(made) == [23, 59], "5 periods after its last word it is forgotten"
-    said = "1 times no message of an input came for longer than 1 s: the time after that is left out"
+    said = "times without a message of an input for longer than 1 s: 1; the rest of each is left out"
     assert any(said in note and "give a larger --hold" in note for note in made.report.notes)
     values[50:, 5:] = np.nan  # its last message counts, too
     ended = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
-    assert lengths(ended) == [23, 13] and any(note.startswith(f"2{said[1:]}") for note in ended.report.notes)
+    assert lengths(ended) == [23, 13] and any(said.replace(": 1", ": 2") in note for note in ended.report.notes)
     time, values = steady()
     values[20:40, 5:] = np.nan
     made = resample([table(time, values)], porter(), LogOptions(), hold=10.0)
