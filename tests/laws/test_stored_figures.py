@@ -194,6 +194,7 @@ OTHERS = {  # rows of the table of other settings, with the folder and the metho
     "SAILR, 300,000 steps": ("plateau/quadrotor", "sailr"),
     "SAILR, η = 0.15, 300,000 steps": ("former_plateau/quadrotor", "sailr"),
     "SECAS, 300,000 steps": ("plateau/quadrotor", "secas"),
+    "PSF, 300,000 steps": ("plateau/quadrotor", "psf"),
     "PSF, hard margin 0.4 m, 300,000 steps": ("former_plateau/quadrotor", "psf"),
     "PSF, hard margin 0.4 m": ("psf_hard/quadrotor", "psf"),
     "TD3-Lagrange, 300,000 steps": ("plateau/quadrotor", "lagrange"),
