@@ -78,7 +78,9 @@ def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
         number = vehicle.current_period.number + 2
         plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.8, 0.0, 0.0]])
         assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that period has begun"
-        assert vehicle.wait(number + 1).input == pytest.approx(plan[1])
+        second_period = vehicle.wait(number + 1)  # a machine that stalls misses it, and goes on later in the plan
+        flown_rows = np.vstack([plan, np.zeros((ROBOT.horizon, 3))])
+        assert second_period.input == pytest.approx(flown_rows[min(second_period.number - number, ROBOT.horizon)])
         vehicle.leave()
         with pytest.raises(MavlinkError, match="ended"):
             vehicle.wait(number + 5)
