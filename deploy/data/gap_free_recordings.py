@@ -87,9 +87,9 @@ def gap_free_recordings(
     counts = {
         "gaps in the stamps, at which the recording is cut: {}": gaps,
         "jumps of the pose, at which the recording is cut: {}": jumps,
-        "changes of an input beside missing messages of it, at which the recording is cut: {}": lost,
-        f"times without a message of an input for longer than {hold:g} s: {{}}; the rest of each is left out. If the "
-        "robot keeps an input until the next message, give a larger --hold": silent,
+        "changes of an input while messages of it are missing, at which the recording is cut: {}": lost,
+        f"pauses of more than {hold:g} s between messages of an input: {{}}. The recording leaves out what follows "
+        f"these {hold:g} s. If the robot keeps an input until the next message, give a larger --hold": silent,
         "rows with the stamp of the row before and another pose, which are left out: {}": shared,
     }
     return recordings, [note.format(count) for note, count in counts.items() if count]

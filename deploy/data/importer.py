@@ -154,21 +154,21 @@ def import_sources(
 
 
 def _notes_by_source(paths: Sequence[Path], reports: Sequence[ImportReport]) -> tuple[str, ...]:
-    """Return all notes, each once, after the names of its sources if there are several."""
-    sources: dict[str, list[str]] = {}
+    """Return each note once. If there are several sources, it begins with the names of those that it is about."""
+    names: dict[str, list[str]] = {}
     for path, report in zip(paths, reports, strict=True):
-        for note in report.notes:
-            sources.setdefault(note, []).append(path.name)
+        for note in dict.fromkeys(report.notes):
+            names.setdefault(note, []).append(path.name)
+    return tuple(_after_names(note, of_note, len(paths)) for note, of_note in names.items())
 
-    def after_names(note: str, names: list[str]) -> str:
-        if len(paths) == 1 or names[0] in note:
-            return note
-        if len(names) == len(paths):
-            return f"all files: {note}"
-        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-        return f"{', '.join(names[:MOST_NAMES])}{more}: {note}"
 
-    return tuple(after_names(note, names) for note, names in sources.items())
+def _after_names(note: str, names: list[str], sources: int) -> str:
+    if sources == 1 or names[0] in note:
+        return note
+    if len(names) == sources:
+        return f"all files: {note}"
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return f"{', '.join(names[:MOST_NAMES])}{more}: {note}"
 
 
 def _refuse_options(options: LogOptions, delay: float, hold: float) -> None:

@@ -21,6 +21,8 @@ from brakeline.sim.autopilot.autopilot_server import TruthSender, WallClock, ser
 from brakeline.sim.autopilot.endpoint import Autopilot
 from tests.robots import GROUND
 
+STALL = 0.05  # s; after a longer one (`stalled`), a flight in real time may have missed a period of 0.2 s
+
 
 def no_answer(requests: Sequence[pb.Request]) -> NoReturn:
     """Ask a safety service that does not answer."""

@@ -22,7 +22,7 @@ from brakeline.sim.autopilot import autopilot_server
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
-from tests.actors.conftest import served
+from tests.actors.conftest import STALL, served
 from tests.actors.test_lockstep_quadrotor import RULES, quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until
@@ -133,51 +133,57 @@ def test_the_autopilot_brakes_when_the_link_dies() -> None:
         until(lambda: np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1, "it brakes", 4.0)
 
 
-def flown(flying: Flying, plan: np.ndarray, count: int) -> np.ndarray:
-    """Fly a plan, and return the inputs (count, 3) of as many periods; again, if a stalled machine missed one."""
+def flown(flying: Flying, plan: np.ndarray, count: int, stalled: Callable[[], float]) -> np.ndarray:
+    """Fly a plan, and return the inputs (count, 3) of as many periods. Fly again if the machine stalled."""
     vehicle, _, frames = flying
     for _ in range(5):
         until_it_hovers(vehicle)
         frames.clear()
         number = vehicle.current_period.number + 2
         if not vehicle.commit(plan, number):
-            continue  # the machine stalled before the commit
+            assert stalled() > STALL, "the commit was late, although the machine did not stall"
+            continue
         periods = [vehicle.wait(number + k) for k in range(count)]
         if [current.number - number for current in periods] == list(range(count)):
             return np.array([current.input for current in periods])
-    raise AssertionError("the machine missed periods in each of five flights")
+        assert stalled() > STALL, "a period was missed, although the machine did not stall"
+    raise AssertionError("the machine stalled in each of five flights")
 
 
-def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flying) -> None:
+def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(
+    flying: Flying, stalled: Callable[[], float]
+) -> None:
     plan, (_, _, frames) = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]]), flying
-    assert flown(flying, plan, 6) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
+    assert flown(flying, plan, 6, stalled) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
 
 
 @of_one_autopilot
-def test_inputs_keep_to_the_robots_slew(flying: Flying, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inputs_keep_to_the_robots_slew(
+    flying: Flying, monkeypatch: pytest.MonkeyPatch, stalled: Callable[[], float]
+) -> None:
     vehicle, _, _ = flying
     monkeypatch.setattr(vehicle, "_robot", replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2)))
-    inputs = flown(flying, np.tile([1.0, 0.0, 0.0], (3, 1)), 5)
+    inputs = flown(flying, np.tile([1.0, 0.0, 0.0], (3, 1)), 5, stalled)
     assert inputs[:, 0] == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
 
 
 @of_one_autopilot
-def test_a_late_plan_does_not_count_and_a_newer_one_does(flying: Flying) -> None:
+def test_a_late_plan_does_not_count_and_a_newer_one_does(flying: Flying, stalled: Callable[[], float]) -> None:
     vehicle, _, _ = flying
     first, second = np.full((3, 3), 0.3), np.full((3, 3), 0.6)
     for _ in range(5):  # a machine that stalls may miss the next period
         until_it_hovers(vehicle)
         number = vehicle.current_period.number + 2
-        if not vehicle.commit(first, number) or vehicle.wait(number).number != number:
-            continue
-        assert not vehicle.commit(second, number), "the period has begun"
-        assert vehicle.current_period.input == pytest.approx(first[0])
-        if vehicle.commit(second, number + 1) and (after := vehicle.wait(number + 1)).number == number + 1:
-            assert after.input == pytest.approx(second[0])
-            break
+        if vehicle.commit(first, number) and vehicle.wait(number).number == number:
+            assert not vehicle.commit(second, number), "the period has begun"
+            assert vehicle.current_period.input == pytest.approx(first[0])
+            if vehicle.commit(second, number + 1) and (after := vehicle.wait(number + 1)).number == number + 1:
+                assert after.input == pytest.approx(second[0])
+                break
+        assert stalled() > STALL, "a period was missed, although the machine did not stall"
     else:
-        raise AssertionError("the machine missed a period in each of five flights")
+        raise AssertionError("the machine stalled in each of five flights")
     with pytest.raises(BadInput):
         vehicle.commit(np.full((2, 3), np.nan), number + 4)
 

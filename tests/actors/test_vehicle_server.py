@@ -33,7 +33,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
-from tests.actors.conftest import served
+from tests.actors.conftest import STALL, served
 from tests.actors.test_flight_process import STANDING
 from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import QUADROTOR
@@ -78,9 +78,10 @@ def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
         number = vehicle.current_period.number + 2
         plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.8, 0.0, 0.0]])
         assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that period has begun"
-        second_period = vehicle.wait(number + 1)  # a machine that stalls misses it, and goes on later in the plan
-        flown_rows = np.vstack([plan, np.zeros((ROBOT.horizon, 3))])
-        assert second_period.input == pytest.approx(flown_rows[min(second_period.number - number, ROBOT.horizon)])
+        period = vehicle.wait(number + 1)
+        assert period.number == number + 1 or stalled() > STALL, "a machine that stalls may miss it"
+        then = np.vstack([plan, np.zeros((ROBOT.horizon, 3))])
+        assert period.input == pytest.approx(then[min(period.number - number, ROBOT.horizon)])
         vehicle.leave()
         with pytest.raises(MavlinkError, match="ended"):
             vehicle.wait(number + 5)
@@ -178,7 +179,7 @@ def test_an_invalid_link_is_an_error(flown: tuple[str, Autopilot]) -> None:
 
 
 def test_invalid_commands_are_skipped_the_flight_goes_on_and_its_end_brakes_the_vehicle(
-    flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture
+    flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture, stalled: Callable[[], float]
 ) -> None:
     rejected, (url, autopilot) = RejectedMessages(), flown
     frames: list[pb.MavlinkFrame] = []
@@ -202,7 +203,7 @@ def test_invalid_commands_are_skipped_the_flight_goes_on_and_its_end_brakes_the_
         reply = vehicle._ask(misshapen)
         assert reply is not None and reply.error.type == "BadMessage" and not reply.in_time
         after = vehicle.wait(vehicle.current_period.number + 3)
-        assert not after.input.any(), "no invalid plan was flown"
+        assert not after.input.any() and (not after.lost or stalled() > STALL), "no invalid plan was flown"
         until(lambda: not vehicle.wait(vehicle.current_period.number + 1).lost, "the flight goes on")
         until(lambda: rejected.count >= 11, "the server's count")
         plan, speeds = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]]), []
@@ -211,7 +212,8 @@ def test_invalid_commands_are_skipped_the_flight_goes_on_and_its_end_brakes_the_
             flies = vehicle.commit(plan, number)
             vehicle.wait(number + 2)
             speeds.append(np.linalg.norm(vehicle.current_period.report.measured[3:6]) if flies else 0.0)
-        assert speeds[-1] > 0.5, "a valid plan still counts"
+            assert speeds[-1] > 0.5 or stalled() > STALL, "a valid plan still counts"
+        assert speeds[-1] > 0.5, "the machine stalled in each of five flights"
     assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
     assert setpoints(frames)[-1].vy == 0.0, "the plan was sent to its end"
     lines = [record.message for record in caplog.records if "passed over" in record.message]

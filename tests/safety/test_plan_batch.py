@@ -252,9 +252,24 @@ def test_an_obstacle_that_is_not_possible_costs_its_robot_alone_the_decision(cha
             assert outcome.answers.row(0).kind == FAILSAFE and outcome.inputs[0, 0] < 0.2
 
 
-def test_obstacles_of_another_number_of_robots_are_refused_also_beside_an_invalid_state() -> None:
-    plans, free = BackupPlanBatch(SAFETY, 2), ObstacleArrays.of([Shapes.of([], 2)] * 3)
-    outcome = plans.decide(np.array([[math.nan] * 5, [0.0] * 5]), np.tile([0.2, 0.0], (2, 1)), free)
+POST = Shapes.of([Obstacle("cylinder", (0.9, 0.0), (0.1,))], 2)
+AROUND = ObstacleArrays.of([POST] * 2)
+
+
+@pytest.mark.parametrize(
+    "obstacles",
+    [
+        ObstacleArrays.of([POST] * 3),
+        ObstacleArrays.of([Shapes.of([Obstacle("sphere", (0.9, 0.0, 0.0), (0.1,))], 3)] * 2),
+        replace(AROUND, axes=AROUND.axes[..., 0]),
+        replace(AROUND, rho=AROUND.rho[:, 0]),
+        replace(AROUND, count=AROUND.count[:1]),
+    ],
+    ids=["another number of robots", "in space", "axes", "rho", "count"],
+)
+def test_obstacles_of_other_shapes_brake_all_robots_also_beside_an_invalid_state(obstacles: ObstacleArrays) -> None:
+    plans = BackupPlanBatch(SAFETY, 2)
+    outcome = plans.decide(np.array([[math.nan] * 5, [0.0] * 5]), np.tile([0.2, 0.0], (2, 1)), obstacles)
     assert not outcome.decided.any() and "obstacles" in outcome.failure and not outcome.inputs.any()
 
 

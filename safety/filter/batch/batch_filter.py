@@ -94,7 +94,7 @@ def completed(
 
 def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:
     """Check the shapes and types of all arrays. Raises BadRequest with the field's name."""
-    B, K = len(requests), requests.obstacles.rho.shape[1]
+    B, K = len(requests), requests.obstacles.slots
     types = {"b": xp.bool, "f": xp.float64}
     for name, value, kind, shape in _expected(robot, requests):
         if tuple(value.shape) != (B, *shape):
@@ -103,7 +103,7 @@ def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:
             raise BadRequest(name, f"{name} has the type {value.dtype}, not {'float64' if kind == 'f' else 'bool'}")
     counts = on_host(requests.obstacles.count)
     if counts.dtype.kind != "i":
-        raise BadRequest("obstacles.count", f"obstacles.count has the type {counts.dtype}, not int64")
+        raise BadRequest("obstacles.count", f"obstacles.count has the type {counts.dtype}: give signed integers")
     if counts.size and not (counts.min() >= 0 and counts.max() <= K):
         raise BadRequest("obstacles.count", f"obstacles.count holds integers from 0 to {K}, the number of slots")
     if not isinstance(requests.model, str) and len(requests.model) != B:
@@ -113,7 +113,7 @@ def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:
 def _expected(robot: Robot, requests: RequestArrays) -> Iterator[tuple[str, Array, str, tuple[int, ...]]]:
     """Yield the name of each array, the array, its type (f: float64, b: bool) and the shape of its rows."""
     n, m, N, d = robot.state_dim, robot.action_dim, robot.horizon, robot.position_dim
-    obstacles, K = requests.obstacles, requests.obstacles.rho.shape[1]
+    obstacles = requests.obstacles
     yield "state", requests.state, "f", (n,)
     yield "action", requests.action, "f", (m,)
     yield "input_in_force", requests.input_in_force, "f", (m,)
@@ -121,13 +121,9 @@ def _expected(robot: Robot, requests: RequestArrays) -> Iterator[tuple[str, Arra
     yield "known_free", requests.known_free, "b", ()
     if not isinstance(requests.turn_aside, bool):
         yield "turn_aside", requests.turn_aside, "b", ()
-    yield "obstacles", obstacles.center, "f", (K, d)
-    yield "obstacles.axes", obstacles.axes, "f", (K, d, d)
-    yield "obstacles.half", obstacles.half, "f", (K, d)
-    yield "obstacles.round", obstacles.round, "f", (K, d)
-    yield "obstacles.rho", obstacles.rho, "f", (K,)
-    yield "obstacles.margin", obstacles.margin, "f", (K,)
-    yield "obstacles.count", obstacles.count, "i", ()
+    for name, shape in obstacles.row_shapes(d).items():
+        field = "obstacles" if name == "center" else f"obstacles.{name}"
+        yield field, getattr(obstacles, name), "i" if name == "count" else "f", shape
     if requests.widening is not None:
         yield "widening", requests.widening, "f", ()
     if requests.state_widening is not None:

@@ -85,6 +85,17 @@ class ObstacleArrays:
     margin: Array
     count: Array
 
+    @property
+    def slots(self) -> int:
+        """K; 0 if `rho` has another number of dimensions than 2."""
+        return int(self.rho.shape[1]) if self.rho.ndim == 2 else 0
+
+    def row_shapes(self, d: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape that one row of each array has, in d dimensions."""
+        K = self.slots
+        shapes = {"center": (K, d), "axes": (K, d, d), "half": (K, d), "rho": (K,), "round": (K, d), "margin": (K,)}
+        return shapes | {"count": ()}
+
     @staticmethod
     def of(shapes: Sequence[Shapes]) -> ObstacleArrays:
         """Pad the obstacles of B requests to the same number. All have the same number of dimensions."""

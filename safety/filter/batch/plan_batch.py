@@ -152,10 +152,9 @@ class BackupPlanBatch:
             usable &= np.isfinite(observations).all(axis=1)
             observations = np.where(usable[:, None], observations, np.float32(0.0))
         # One row that is not valid would cost all others their decisions: it gets valid values, and no decision.
-        usable &= _plausible_obstacles(obstacles, self._size)
+        obstacles, possible = self._possible_obstacles(obstacles)
+        usable &= possible
         measured = np.where(usable[:, None], states, 0.0)
-        if obstacles.count.shape == usable.shape:
-            obstacles = replace(obstacles, count=np.where(usable, obstacles.count, 0))
         try:
             answers = self.safety.decide_batch(self.request(measured, actions, obstacles, observations))
         except (BadRequest, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -172,6 +171,18 @@ class BackupPlanBatch:
         kind, verified = np.where(decided, answers.kind, KINDS.index(FAILSAFE)), answers.verified & decided
         answers = replace(answers, kind=kind, verified=verified, singly=singly)
         return BatchOutcome(inputs, decided, answers, NO_DECISION)
+
+    def _possible_obstacles(self, obstacles: ObstacleArrays) -> tuple[ObstacleArrays, Flags]:
+        """Return the obstacles without those of robots that have an impossible one, and which robots (B,) have none.
+
+        Arrays of other shapes are returned as they are: the filter refuses them.
+        """
+        shapes = obstacles.row_shapes(self.robot.position_dim)
+        if any(getattr(obstacles, name).shape != (self._size, *shape) for name, shape in shapes.items()):
+            return obstacles, np.ones(self._size, dtype=bool)
+        with np.errstate(all="ignore"):
+            possible = np.asarray(plausible(np, obstacles))
+        return replace(obstacles, count=np.where(possible, obstacles.count, 0)), possible
 
     def contains(self, states: Array) -> Flags:
         """Return whether measured states (B, n) lie in the predicted sets: `Prediction.contains` for each row."""
@@ -255,14 +266,6 @@ class BackupPlanBatch:
 def _plausible(states: Array) -> Flags:
     """Return which measured states (B, n) a request may hold."""
     return np.asarray((np.abs(states) <= FARTHEST).all(axis=1))  # NaN fails too
-
-
-def _plausible_obstacles(obstacles: ObstacleArrays, size: int) -> Flags:
-    """Return which robots (B,) have obstacles of possible numbers. Of arrays that do not fit, the batch is refused."""
-    if obstacles.count.shape != (size,) or obstacles.rho.shape[:1] != (size,):
-        return np.ones(size, dtype=bool)
-    with np.errstate(all="ignore"):
-        return np.asarray(plausible(np, obstacles))
 
 
 def _precise(array: Array) -> Array:

@@ -283,7 +283,7 @@ def test_cut_where_a_message_of_an_input_that_changes_is_lost():
     given[70:80, 0] = 0.3
     whole = resample([with_messages(given)], porter(), LogOptions())
     cut = resample([with_messages(given, lost=[30, 75])], porter(), LogOptions())
-    note = "changes of an input beside missing messages of it, at which the recording is cut: 1"
+    note = "changes of an input while messages of it are missing, at which the recording is cut: 1"
     assert lengths(whole) == [99] and lengths(cut) == [29, 68] and note in cut.report.notes
     of_all, left = (np.vstack([t.inputs for t in made.data.trajectories]) for made in (whole, cut))
     assert np.allclose(left, np.delete(of_all, [29, 30], axis=0))
@@ -334,7 +334,7 @@ def test_an_input_is_held_and_forgotten_after_a_while():
     values[20:40, 5:] = np.nan  # nobody spoke for 4 s
     made = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
     assert lengths(made) == [23, 59], "5 periods after its last word it is forgotten"
-    said = "times without a message of an input for longer than 1 s: 1; the rest of each is left out"
+    said = "pauses of more than 1 s between messages of an input: 1. The recording leaves out what follows"
     assert any(said in note and "give a larger --hold" in note for note in made.report.notes)
     values[50:, 5:] = np.nan  # its last message counts, too
     ended = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
