@@ -26,7 +26,8 @@ from scipy.optimize import linprog
 from brakeline.compilation import compiled
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.calibration_samples import Samples
-from brakeline.safety.model.error_bounds import envelopes, least_squares, whitening
+from brakeline.safety.model.envelopes import Envelopes
+from brakeline.safety.model.error_bounds import least_squares, whitening
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.model.one_step import Features
 
@@ -53,7 +54,7 @@ class Noise:
         for fold in np.unique(s.period_fold):
             held = s.period_fold == fold
             off[held] = s.y[held] - phi[held] @ least_squares(phi[~held], s.y[~held]).T
-        noise = Noise(*envelopes(np.abs(s.v), np.abs(off), 1.0))
+        noise = Noise(*Envelopes(np.abs(s.v), np.abs(off)).tightest())
         scores = np.sort((np.abs(off) / noise.sizes(s.v)).max(1))
         factor = scores[min(math.ceil((len(scores) + 1) * (1.0 - ModelConfig.outside)), len(scores)) - 1]
         return Noise(factor * noise.kappa, factor * noise.w)

@@ -10,15 +10,21 @@ The generators g_j share the rows of W.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import ErrorBoundError
+from brakeline.safety.model.envelopes import ROWS_A_ROUND, Envelopes
+from brakeline.safety.model.linear_program import INFEASIBLE, OPTIMAL, UNBOUNDED, LinearProgram
 
 Array = NDArray[np.float64]
 
-ROWS_A_ROUND = 64  # samples that each round adds to a linear program
+NO_BOX = {  # why there is no hull of the consistent matrices
+    UNBOUNDED: "the samples do not bound the matrix",
+    INFEASIBLE: "no matrix is consistent with all samples: the noise bound is too small",
+}
 
 
 @dataclass(frozen=True)
@@ -90,61 +96,11 @@ def whitening(z: Array) -> Array:
         raise ErrorBoundError("the regressors do not span their space: record more varied inputs") from None
 
 
-def envelopes(features: Array, values: Array, inflation: float, typical: Array | None = None) -> tuple[Array, Array]:
-    """Return the envelopes (κ, w) with κ_i f + w_i >= v_i for all samples, times `inflation` (docs/method.md §1c).
-
-    A linear program minimises the mean of each bound, or the bound at `typical` features. It starts from few samples
-    and adds violated ones until there are none. What its tolerance leaves violated is added to w.
-
-    Args:
-        features (T, q), values (T, n): samples, none negative.
-        inflation: factor on the bounds.
-        typical (q,) or (n, q): features for which the bounds are tightest; by default the samples' mean.
-
-    Returns:
-        κ (n, q) and w (n,).
-    """
-    if not len(values):
-        raise ErrorBoundError("no sample to bound")
-    tight_at = np.broadcast_to(features.mean(0) if typical is None else typical, (values.shape[1], features.shape[1]))
-    costs = np.column_stack([tight_at, np.ones(len(tight_at))])
-    rows = np.column_stack([features, np.ones(len(features))])
-    farthest = rows.argmax(0)
-    coordinates = zip(values.T, costs, strict=True)
-    bounds = np.array([_envelope(rows, np.ascontiguousarray(v), cost, farthest) for v, cost in coordinates]) * inflation
-    return bounds[:, :-1], bounds[:, -1]
-
-
-def _envelope(rows: Array, values: Array, cost: Array, active: NDArray[np.int64]) -> Array:
-    """Return the bound [κ, w] (q + 1,) of one coordinate. active: some samples to start from, besides the largest."""
-    from scipy.optimize import linprog  # here: it takes half a second to load, and a service does not need it
-
-    active = np.union1d(_largest(values), active)
-    scale = float(values.max()) or 1.0
-    while True:
-        solution = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
-        if solution.status != 0:
-            raise ErrorBoundError(f"no envelope of the residuals: {solution.message}")
-        bound = np.maximum(solution.x, 0.0)
-        short = values / scale - rows @ bound
-        worst = _largest(short)
-        more = np.union1d(active, worst[short[worst] > 1e-7])
-        if len(more) == len(active):
-            bound[-1] += max(float(short.max()), 0.0) + 1e-9
-            return np.asarray(bound * scale)
-        active = more
-
-
-def _largest(values: Array) -> NDArray[np.int64]:
-    """Return the indices of the `ROWS_A_ROUND` largest values (T,), in no order."""
-    return np.argpartition(values, -min(ROWS_A_ROUND, len(values)))[-ROWS_A_ROUND:]
-
-
 def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> ErrorBound:
     """Return bound (c): the predictor C (n, nz), and an envelope of its residual over z (T, nz), y (T, n)."""
     n, nz = C.shape
     rest = np.abs(y - z @ C.T)
-    kappa, w = envelopes(np.abs(z), rest, inflation)
+    kappa, w = Envelopes(np.abs(z), rest).tightest(inflation=inflation)
     return ErrorBound(C, np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
 
 
@@ -185,38 +141,31 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
 
     They share their active samples. Samples left out only widen the hull, so every result is an outer bound.
     """
-    from scipy.optimize import linprog
-
     nz, unit = white.shape[1], float(size.mean()) or 1.0
     y, size = y / unit, size / unit  # the solver's tolerances are absolute
-    active = np.unique(np.concatenate([np.argsort(size)[:ROWS_A_ROUND], np.abs(white).argmax(0)]))
+    program, active = LinearProgram(nz, least=-np.inf), np.zeros(len(y), dtype=bool)
+
+    def hold(samples: NDArray[np.int64]) -> None:
+        new = np.unique(samples[~active[samples]])
+        active[new] = True
+        program.add(white[new], y[new] - size[new], y[new] + size[new])
+
+    hold(np.concatenate([np.argsort(size)[:ROWS_A_ROUND], np.abs(white).argmax(0)]))
     corners = np.zeros((2, nz))
-    for axis in range(nz):
-        for side, sign in enumerate((1.0, -1.0)):
-            while True:
-                rows, values, bound = white[active], y[active], size[active]
-                solution = linprog(
-                    sign * np.eye(nz)[axis],
-                    A_ub=np.vstack([rows, -rows]),
-                    b_ub=np.concatenate([values + bound, bound - values]),
-                    bounds=(None, None),
-                )
-                if solution.status in (3, 4) and len(active) < len(y):  # unbounded, so it seems, on so few samples
-                    spread = np.arange(0, len(y), max(1, len(y) // (4 * ROWS_A_ROUND)))
-                    more = np.union1d(active, spread)
-                    active = more if len(more) > len(active) else np.arange(len(y))
-                    continue
-                if solution.status == 3:
-                    raise ErrorBoundError("the samples do not bound the matrix")
-                if solution.status == 2:
-                    raise ErrorBoundError("no matrix is consistent with all samples: the noise bound is too small")
-                if solution.status != 0:
-                    raise ErrorBoundError(f"no bound of the consistent matrices: {solution.message}")
-                over = np.abs(y - white @ solution.x) - size
-                worst = np.argsort(over)[-ROWS_A_ROUND:]
-                more = np.union1d(active, worst[over[worst] > 1e-6])
-                if len(more) == len(active):
-                    break
-                active = more
-            corners[side, axis] = solution.x[axis] - sign * 1e-6
+    for axis, (side, sign) in product(range(nz), enumerate((1.0, -1.0))):
+        while True:
+            state, row = program.minimise(sign * np.eye(nz)[axis])
+            if state == UNBOUNDED and not active.all():  # so it seems, on so few samples
+                spread = np.arange(0, len(y), max(1, len(y) // (4 * ROWS_A_ROUND)))
+                hold(spread if not active[spread].all() else np.arange(len(y)))
+                continue
+            if state != OPTIMAL:
+                raise ErrorBoundError(NO_BOX.get(state, f"no bound of the consistent matrices: {state}"))
+            over = np.abs(y - white @ row) - size
+            worst = np.argsort(over)[-ROWS_A_ROUND:]
+            more = worst[(over[worst] > 1e-6) & ~active[worst]]
+            if not len(more):
+                break
+            hold(more)
+        corners[side, axis] = row[axis] - sign * 1e-6
     return unit * corners[0], unit * corners[1]

@@ -11,9 +11,9 @@ from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.envelopes import Envelopes
 from brakeline.safety.model.error_bounds import (
     ErrorBound,
-    envelopes,
     least_squares,
     matrix_zonotope,
     residual,
@@ -164,7 +164,7 @@ def _stopping_distance_of_plans(whole: Windows, model_config: ModelConfig) -> tu
 
 def _length_envelope(z: Array, lengths: Array, inflation: float) -> tuple[Array, float]:
     """Return the envelope (κ, w) of lengths (T,) for regressors z (T, nz)."""
-    kappa, w = envelopes(np.abs(z), lengths[:, None], inflation)
+    kappa, w = Envelopes(np.abs(z), lengths[:, None]).tightest(inflation=inflation)
     return kappa[0], float(w[0])
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.model.error_bounds import ErrorBound, envelopes
+from brakeline.safety.model.envelopes import Envelopes
+from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.one_step import OneStep
 from brakeline.safety.model.windows import plan_regressor_map
 
@@ -172,10 +173,11 @@ def _tightest(features: Array, values: Array, inflation: float, plans: Array, sh
     Two linear programs: the first minimises the mean of the half-widths, in which fast plans weigh most; the second the
     mean of their ratios to those of the first. So a slow plan counts as much: close to obstacles, a robot is slow.
     """
-    slopes, w = envelopes(features, values, inflation, share @ plans)
+    envelopes = Envelopes(features, values)
+    slopes, w = envelopes.tightest(share @ plans, inflation)
     widths = plans @ slopes.T + w
     weights = share.T / np.maximum(widths, 1e-9 * widths.max(0, keepdims=True) + 1e-300)
-    return envelopes(features, values, inflation, (weights / weights.sum(0)).T @ plans)
+    return envelopes.tightest((weights / weights.sum(0)).T @ plans, inflation)
 
 
 def shares(errors: Array, widths: Array) -> Array:

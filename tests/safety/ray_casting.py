@@ -6,7 +6,7 @@ from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, 
 
 
 def cast(obstacles, at, ways, far):
-    """Return the ranges (...) [m] from a point (d,) along unit vectors (..., d) to the nearest solid, at most `far`."""
+    """Return the ranges (...) [m] from points (d,) or (..., d) along unit vectors (..., d) to the nearest solid, at most `far`."""
     ranges = np.full(ways.shape[:-1], far)
     for obstacle in obstacles:
         enters, leaves = crossing(
@@ -19,7 +19,7 @@ def cast(obstacles, at, ways, far):
 
 def crossing(obstacle: Obstacle, start, ways):
     """Return where rays enter and leave a solid [m], in its frame; a solid is what slabs and a round body share."""
-    kind, size, d = obstacle.kind, obstacle.size, len(start)
+    kind, size, d = obstacle.kind, obstacle.size, ways.shape[-1]
     slabs = np.array([[-np.inf], [np.inf]]).repeat(d, axis=1)
     if kind == BOX:
         slabs = np.array([[-0.5], [0.5]]) * size
@@ -32,8 +32,8 @@ def crossing(obstacle: Obstacle, start, ways):
     enters, leaves = between.min(axis=0).max(axis=-1), between.max(axis=0).min(axis=-1)
     if kind in (CYLINDER, SPHERE):
         middle, across = (part[..., : 2 if kind == CYLINDER else d] for part in (start, ways))
-        length, along = np.maximum((across * across).sum(axis=-1), 1e-300), across @ middle
-        inside = along * along - length * (middle @ middle - size[0] ** 2)
+        length, along = np.maximum((across * across).sum(axis=-1), 1e-300), (across * middle).sum(axis=-1)
+        inside = along * along - length * ((middle * middle).sum(axis=-1) - size[0] ** 2)
         half = np.sqrt(np.where(inside < 0.0, np.nan, inside))  # NaN: the ray passes by
         enters, leaves = np.fmax(enters, (-along - half) / length), np.fmin(leaves, (-along + half) / length)
         leaves = np.where(inside < 0.0, -np.inf, leaves)

@@ -13,9 +13,9 @@ from scipy.spatial import ConvexHull
 
 from brakeline.errors import ErrorBoundError
 from brakeline.safety.filter.reachable_tube import RecursionMaps, stack_recursive
+from brakeline.safety.model.envelopes import Envelopes
 from brakeline.safety.model.error_bounds import (
     ErrorBound,
-    envelopes,
     least_squares,
     matrix_zonotope,
     residual,
@@ -211,7 +211,7 @@ def pairs_across_trajectories():
 
 
 def no_samples():
-    envelopes(np.ones((0, 2)), np.zeros((0, 1)), 1.0)
+    Envelopes(np.ones((0, 2)), np.zeros((0, 1)))
 
 
 REFUSED = {
@@ -253,12 +253,12 @@ def test_the_envelope_bounds_every_sample_and_is_the_smallest():
     rng = np.random.default_rng(1)
     features = np.abs(rng.normal(size=(3000, 3)))
     values = features @ [0.1, 0.0, 0.3] + 0.02 * rng.random(3000)
-    (kappa,), (w,) = envelopes(features, values[:, None], 1.0)
+    (kappa,), (w,) = Envelopes(features, values[:, None]).tightest()
     assert (features @ kappa + w >= values).all()
     rows = np.column_stack([features, np.ones(3000)])
     whole = linprog(np.append(features.mean(0), 1.0), A_ub=-rows, b_ub=-values, bounds=(0, None))
     assert features.mean(0) @ kappa + w == pytest.approx(whole.fun, rel=1e-5)
-    (wider,), (more,) = envelopes(features, values[:, None], 1.2)
+    (wider,), (more,) = Envelopes(features, values[:, None]).tightest(inflation=1.2)
     assert np.allclose(wider, 1.2 * kappa)
     assert more == pytest.approx(1.2 * w)
 
@@ -269,7 +269,7 @@ def test_the_envelope_bounds_whatever_the_scale(seed, scale):
     rng = np.random.default_rng(seed)
     features = np.abs(rng.normal(size=(200, 2)))
     values = scale * rng.random(200) ** 4
-    (kappa,), (w,) = envelopes(features, values[:, None], 1.0)
+    (kappa,), (w,) = Envelopes(features, values[:, None]).tightest()
     assert (features @ kappa + w >= values).all()
     assert scale or kappa.sum() + w < 1e-6, "the envelope of zeros is zero"
 

@@ -252,9 +252,7 @@ def drive_among_posts(rng, degrees, periods):
             break
         sensors = poses[:, :2] + MOUNT.x * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
         ways = np.stack([np.cos(poses[:, 2] + angles), np.sin(poses[:, 2] + angles)], axis=1)
-        ranges, dark = np.full((2, BEAMS), FAR)
-        for i in np.flatnonzero(~outside):
-            ranges[i], dark[i] = (cast(hit, sensors[i], ways[i : i + 1], FAR)[0] for hit in (posts, black))
+        ranges, dark = (np.where(outside, FAR, cast(hit, sensors, ways, FAR)) for hit in (posts, black))
         ranges = np.where(ranges < FAR, np.maximum(ranges + rng.choice([-1.0, 1.0]) * ERRORS.range, 1e-3), np.inf)
         silent = ((dark < FAR) & (dark <= ranges + 0.021)) | (rng.random(BEAMS) < share)
         silent &= period >= 2  # what the first scans show is in the memory
