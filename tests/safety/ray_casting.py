@@ -6,7 +6,7 @@ from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, 
 
 
 def cast(obstacles, at, ways, far):
-    """Return the ranges (...) [m] from points (d,) or (..., d) along unit vectors (..., d) to a solid, at most `far`."""
+    """Return the ranges (...) [m] from points (d,) or (..., d) along unit vectors (..., d) to a solid, or `far`."""
     ranges = np.full(ways.shape[:-1], far)
     for obstacle in obstacles:
         enters, leaves = crossing(
