@@ -390,5 +390,5 @@ def mean_half_width(model: ModelSet, data: Dataset) -> float:
         z = z[:, : robot.regressor_dim + robot.free_steps * robot.action_dim]
     half_widths = model.steps[-1].half_widths(z)[:, : robot.position_dim].mean(axis=1)
     if model.one_step is not None:
-        half_widths *= model.one_step.stretches(robot, z)[:, -1]
+        half_widths *= model.one_step.last_stretches(robot, z)
     return float(half_widths.mean())

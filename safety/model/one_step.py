@@ -50,7 +50,8 @@ class Features:
         p, (first, *others) = np.stack(columns), self.terms.T
         products = p[first]
         for factor in others:
-            products *= p[factor]
+            more = np.flatnonzero(factor)  # the other factors are the constant 1
+            products[more] *= p[factor[more]]
         return np.asarray(products.T)
 
     def subset(self, used: Index) -> Features:
@@ -158,14 +159,23 @@ class OneStep:
 
     def rollouts_with_stretch(self, robot: Robot, z: Array) -> tuple[Array, Array]:
         """Return what `rollouts` and `stretches` return, in less time than both."""
+        return self._rolled(robot, z, 0)
+
+    def last_stretches(self, robot: Robot, z: Array) -> Array:
+        """Return the factors (T,) on the last sets of windows z (T, r + m + N·m), in less time than all of them."""
+        return self.rollouts_with_last_stretch(robot, z)[1]
+
+    def rollouts_with_last_stretch(self, robot: Robot, z: Array) -> tuple[Array, Array]:
+        """Return what `rollouts` and `last_stretches` return."""
+        outputs, stretches = self._rolled(robot, z, robot.horizon - 1)
+        return outputs, stretches[:, -1]
+
+    def _rolled(self, robot: Robot, z: Array, first: int) -> tuple[Array, Array]:
+        """first: number of the first period whose stretch is computed."""
         from brakeline.safety.filter.kernels import window_rollout_kernels
 
         whole = np.ascontiguousarray
-        return window_rollout_kernels.rollouts(self.arguments(robot), whole(self.root), self.weight, whole(z))
-
-    def leverages(self, robot: Robot, z: Array) -> Array:
-        """Return the leverages (T, N) of windows z (T, r + m + N·m), with which the sets grow."""
-        return replace(self, weight=1.0).stretches(robot, z) ** 2 - 1.0
+        return window_rollout_kernels.rollouts(self.arguments(robot), whole(self.root), self.weight, whole(z), first)
 
     def arguments(self, robot: Robot) -> Predictor:
         """Return the first argument of the kernels, which is the same for every plan: the predictor and its robot."""

@@ -47,6 +47,7 @@ WEIGHTS = (1.0, 3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 PLANS_EVERY = 4  # from every fourth of these windows, plans whose sets are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
+DIVERGENT = "every predictor of one period leads absurdly far away over a plan: record more driving"
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
 
 
@@ -100,19 +101,33 @@ def choose(
             count = len(regression.fit(candidate).features.terms)
             candidates.append((replace(candidate, error=error, features=count), regression))
     candidates = sorted((pair for pair in candidates if np.isfinite(pair[0].error)), key=lambda pair: pair[0].error)
-    good = _good_candidates(candidates, s)
+    good = _good_candidates(candidates, few_windows.z)
     choices = []
     for number, (candidate, regression) in enumerate(good):
         progress(TRIED + (CHOSEN - TRIED) * number / len(good))
         choices.append((_growth(robot, s, regression, candidate, outside), regression))
-    least = min(choice.width for choice, _ in choices)
-    narrow = [pair for pair in choices if pair[0].width <= SIMPLER * least]
-    choice, regression = min(narrow, key=lambda pair: (pair[0].candidate.features, pair[0].width))
+    choice, regression = _simple(choices, s.z)
     return choice, [c for c, _ in candidates], regression
 
 
-def _good_candidates(candidates: list[tuple[Candidate, Regression]], s: Samples) -> list[tuple[Candidate, Regression]]:
-    """Return the candidates whose sets are compared, from the least out-of-fold error on. None of them diverges.
+def _simple(choices: list[tuple[Choice, Regression]], z: Array) -> tuple[Choice, Regression]:
+    """Return the simplest of the choices with narrow sets that diverges in none of all windows z.
+
+    Raises:
+        BadData: all of them diverge.
+    """
+    while choices:
+        least = min(choice.width for choice, _ in choices)
+        narrow = [pair for pair in choices if pair[0].width <= SIMPLER * least]
+        choice, regression = min(narrow, key=lambda pair: (pair[0].candidate.features, pair[0].width))
+        if len(z) <= MOST_TO_CHOOSE or not regression.diverges(choice.candidate, z):
+            return choice, regression
+        choices = [pair for pair in choices if pair[0] is not choice]
+    raise BadData(DIVERGENT)
+
+
+def _good_candidates(candidates: list[tuple[Candidate, Regression]], z: Array) -> list[tuple[Candidate, Regression]]:
+    """Return the candidates whose sets are compared, from the least out-of-fold error on. None diverges in windows z.
 
     Raises:
         BadData: all of them diverge.
@@ -121,10 +136,10 @@ def _good_candidates(candidates: list[tuple[Candidate, Regression]], s: Samples)
     for candidate, regression in candidates:
         if len(good) == MOST_GOOD or (good and candidate.error > GOOD * good[0][0].error):
             break
-        if not regression.diverges(candidate, s):
+        if not regression.diverges(candidate, z):
             good.append((candidate, regression))
     if not good:
-        raise BadData("every predictor of one period leads absurdly far away over a plan: record more driving")
+        raise BadData(DIVERGENT)
     return good
 
 
@@ -251,9 +266,11 @@ def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candida
     pairs = [*product(WEIGHTS, (0, len(robot.regressor)))]
     scores, logs = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
     for i in regression.folds:
-        one_step, held = regression.fit(candidate, i), fold == i
-        off = after - one_step.rollouts(robot, z)[:, -1:][..., used]
-        leverages, *theirs = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans, full))
+        one_step, held = regression.fit(candidate, i, weight=1.0), fold == i
+        outputs, stretch = one_step.rollouts_with_last_stretch(robot, z)
+        off = after - outputs[:, -1:][..., used]
+        stretches = stretch, *(one_step.last_stretches(robot, one) for one in (plans, full))
+        leverages, *theirs = (one[:, None] ** 2 - 1.0 for one in stretches)
         for p, (weight, level) in enumerate(pairs):
             errors = off / np.sqrt(1.0 + weight * leverages)[..., None]
             shape = Shape.around(spread[:, ~held], errors[~held], typical, level=level, outside=RARE)

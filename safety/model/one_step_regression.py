@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,9 +59,17 @@ class Regression:
                 self._gram[i] += phi.T @ phi
                 self._cross[i] += phi.T @ s.y[some]
         self._paths: dict[int, list[SelectionPath]] = {}
+        self._fits: dict[tuple[float, bool, int], OneStep] = {}
+        self._most = ABSURD * np.abs(s.after).max((0, 1))
 
     def fit(self, candidate: Candidate, without: int = -1, weight: float = 0.0) -> OneStep:
         """Return the predictor that is fitted to all folds but one, with a weight of the leverage."""
+        key = candidate.penalty, candidate.instruments, without
+        if key not in self._fits:
+            self._fits[key] = self._fitted(candidate, without)
+        return replace(self._fits[key], weight=weight)
+
+    def _fitted(self, candidate: Candidate, without: int) -> OneStep:
         folds = [i for i in self.folds if i != without]
         gram, cross = self._gram[folds].sum(0), self._cross[folds].sum(0)
         chosen = [path.best(candidate.penalty) for path in self._paths_without(without, gram, cross)]
@@ -73,7 +81,7 @@ class Regression:
         if candidate.instruments:
             C = self._by_instruments(features, C, places, without)
         root = np.linalg.inv(np.linalg.cholesky(gram))
-        return OneStep(C, features, root, weight)
+        return OneStep(C, features, root)
 
     def _paths_without(self, without: int, gram: Array, cross: Array) -> list[SelectionPath]:
         if without not in self._paths:
@@ -109,12 +117,11 @@ class Regression:
         singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled.T @ scaled), 0.0))
         return float(singular[0]), float(singular[-1] / max(singular[0], 1e-300))
 
-    def diverges(self, candidate: Candidate, s: Samples) -> bool:
-        """Return whether a fit to all folds, or to all but one, predicts a window that leads absurdly far away."""
-        most = ABSURD * np.abs(s.after).max((0, 1))
+    def diverges(self, candidate: Candidate, z: Array) -> bool:
+        """Return whether a fit to all folds, or to all but one, leads absurdly far away in one of these windows z."""
         fits = (self.fit(candidate, without=i) for i in (*self.folds, -1))
         # NaN diverges, too
-        return not all((np.abs(one_step.rollouts(self._robot, s.z)) <= most).all() for one_step in fits)
+        return not all((np.abs(one_step.rollouts(self._robot, z)) <= self._most).all() for one_step in fits)
 
     def out_of_fold(self, candidate: Candidate, s: Samples) -> Array:
         """Return the errors (T, N, n + d·discs) of windows, each predicted without its fold."""

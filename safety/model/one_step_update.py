@@ -191,7 +191,7 @@ def _stretched(in_use: ModelSet, s: Samples, one_step: OneStep) -> float:
     robot, before = in_use.robot, in_use.one_step
     assert before is not None
     plans, full = plans_from(robot, s.z[::PLANS_EVERY]), stop_from_full_speed(robot, s.z, one_step)
-    ratios = [one_step.stretches(robot, z)[:, -1] / before.stretches(robot, z)[:, -1] for z in (plans, full)]
+    ratios = [one_step.last_stretches(robot, z) / before.last_stretches(robot, z) for z in (plans, full)]
     return float(np.exp(np.mean([np.log(ratio).mean() for ratio in ratios])))
 
 

@@ -175,7 +175,7 @@ def regressors_of_braking(z_0, braking, action):
 
 def rollout(predictor, across, weight, window):
     """`rollout_kernels.rollout`."""
-    outputs, factors = rollouts(predictor, across.T, weight, window[None])
+    outputs, factors = rollouts(predictor, across.T, weight, window[None], 0)
     return outputs[0], factors[0]
 
 
@@ -216,11 +216,13 @@ def outputs_of(predictor, z):
     return np.array(outputs)
 
 
-def rollouts(predictor, root, weight, z):
+def rollouts(predictor, root, weight, z, first):
     """`window_rollout_kernels.rollouts`."""
     sums = np.array([np.cumsum(list(features(predictor, window)), axis=0) for window in z])  # (T, N, terms)
     spread = ((sums @ np.tril(root).T) ** 2).sum(axis=2)
-    return outputs_of(predictor, z), np.sqrt(1.0 + weight * spread / np.arange(1, sums.shape[1] + 1))
+    factors = np.sqrt(1.0 + weight * spread / np.arange(1, sums.shape[1] + 1))
+    factors[:, :first] = 1.0
+    return outputs_of(predictor, z), factors
 
 
 def linearized(predictor, z, T):

@@ -132,7 +132,7 @@ def cases(rng, d):
         "extent": (*tube, z, 0.105),
         "next_state": (*step, z, rng.normal(size=9), rng.uniform(1.0, 2.0, 9), start, turn),
         "rollout": (predictor, root.T, weight, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
-        "rollouts": (predictor, root, weight, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
+        "rollouts": (predictor, root, weight, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N)), int(rng.integers(N))),
         "affine": (predictor, *plan, np.array([d + 1, d])),
         "sets_around": (
             *(predictor, root.T, weight, plan[1], np.array([d + 1, d]), directions),

@@ -18,7 +18,7 @@ from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
-from brakeline.safety.model import one_step_regression
+from brakeline.safety.model import one_step_fitting, one_step_regression
 from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, START, driving_kinds
@@ -275,7 +275,7 @@ def test_a_predictor_that_leads_absurdly_far_away_is_not_compared(monkeypatch):
     """A flight was lost to a candidate whose products fed each other until a rollout was infinite."""
     s = samples_of(driven(trajectories=3).joined())
     choice, _, regression = choose(ROBOT, s)
-    assert choice.candidate.degree > 1 and not regression.diverges(choice.candidate, s)
+    assert choice.candidate.degree > 1 and not regression.diverges(choice.candidate, s.z)
     fit = Regression.fit
 
     def exploding(self, candidate, without=-1, weight=0.0):
@@ -283,11 +283,24 @@ def test_a_predictor_that_leads_absurdly_far_away_is_not_compared(monkeypatch):
         return replace(one_step, C=1e200 * one_step.C) if candidate.degree > 1 and without == 3 else one_step
 
     monkeypatch.setattr(Regression, "fit", exploding)
-    assert regression.diverges(choice.candidate, s)
+    assert regression.diverges(choice.candidate, s.z)
     assert choose(ROBOT, s)[0].candidate.degree == 1
     monkeypatch.setattr(one_step_regression, "ABSURD", 1e-3)
     with pytest.raises(BadData, match=r"leads absurdly far away.*record more driving"):
         choose(ROBOT, s)
+
+
+def test_the_chosen_predictor_leads_absurdly_far_away_from_none_of_all_windows(monkeypatch):
+    """Candidates are compared by some of the windows only."""
+    s = samples_of(driven(trajectories=3).joined())
+    monkeypatch.setattr(one_step_fitting, "MOST_TO_CHOOSE", 300)
+    first, diverges = choose(ROBOT, s)[0].candidate, Regression.diverges
+
+    def beyond_the_compared(self, candidate, z):
+        return diverges(self, candidate, z) or (len(z) > 300 and candidate == first)
+
+    monkeypatch.setattr(Regression, "diverges", beyond_the_compared)
+    assert choose(ROBOT, s)[0].candidate != first
 
 
 # --- the half-widths of the sets follow from the errors of recorded windows -------------------------------------------

@@ -22,7 +22,7 @@ def _predict(
 ) -> None:
     """Write the primitives of B windows into p (P, B) and their outputs into y (n, B); add their φ to total (F, B).
 
-    The sums have the order of those of a single window, so the outputs are the same, bit for bit.
+    The sums have the order of those of a single window, so the outputs are the same, bit for bit, if all are finite.
     """
     p[0], y[:] = 1.0, 0.0
     for i in range(len(v)):
@@ -37,11 +37,18 @@ def _predict(
     for f in range(len(terms)):
         first, second, third, fourth = p[terms[f, 0]], p[terms[f, 1]], p[terms[f, 2]], p[terms[f, 3]]
         sums = total[f]
-        for t in range(len(feature)):
-            feature[t] = first[t] * second[t] * third[t] * fourth[t]
-            sums[t] += feature[t]
+        if terms[f, 2] == 0 and terms[f, 3] == 0:  # the constant 1
+            for t in range(len(feature)):
+                feature[t] = first[t] * second[t]
+                sums[t] += feature[t]
+        else:
+            for t in range(len(feature)):
+                feature[t] = first[t] * second[t] * third[t] * fourth[t]
+                sums[t] += feature[t]
         for i in range(len(y)):
             factor, output = C[i, f], y[i]
+            if factor == 0.0:  # most are: an output has features of its own
+                continue
             for t in range(len(feature)):
                 output[t] += factor * feature[t]
 
@@ -65,11 +72,12 @@ def _write_factors(root: Array, total: Array, weight: float, factors: Array, k: 
         factors[t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
 
 
-@compiled(f"Tuple((f8[:,:,::1], f8[:,::1]))({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
-def rollouts(predictor: Predictor, root: Array, weight: float, z: Array) -> tuple[Array, Array]:
+@compiled(f"Tuple((f8[:,:,::1], f8[:,::1]))({PREDICTOR}, f8[:,::1], f8, f8[:,::1], i8)")
+def rollouts(predictor: Predictor, root: Array, weight: float, z: Array, first: int) -> tuple[Array, Array]:
     """Return outputs (T, N, n + D·d) and factors (T, N) of windows z (T, r + m + N·m): see `rollout_kernels.rollout`.
 
-    root (F, F): not transposed. With a weight of 0 all factors are 1, and cost nothing.
+    root (F, F): not transposed. With a weight of 0 all factors are 1, and cost nothing. So are those of the periods
+    before `first`.
     """
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r, P = len(C), len(others), len(others) + 2 * inputs + len(saturations)
@@ -86,7 +94,7 @@ def rollouts(predictor: Predictor, root: Array, weight: float, z: Array) -> tupl
             _copy_columns(window, r + (k + 1) * inputs, v[r : r + inputs])
             _copy_columns(window, r + k * inputs, v[r + inputs :])
             _predict(C, scale, saturations, terms, v, p, total, y)
-            if weight != 0.0:
+            if weight != 0.0 and k >= first:
                 _write_factors(root, total, weight, factors[begin : begin + B], k)
             for t in range(B):
                 one[:] = y[:, t]
