@@ -314,8 +314,8 @@ Collisions: episodes of all runs, with the exact 95 % interval of Clopper and Pe
 independent, although all runs drive the same {episodes}. Steps to 90 %: the training steps until 45 of some 50
 episodes, begun one after the other, had reached the goal; a run that never got there counts with all its steps.
 Recorded periods (see *Methods*) do not count as training steps. Episodes that an intervention cut (SAILR) do not count.
-Decision: mean time of a single decision of policy and filter, on a machine that other work shared; differences
-between methods include those of the load.
+Decision: mean time of a single decision of policy and filter, on a machine that other work shared in some
+runs, but not in all. So do not compare the times of two methods.
 """
 IMPROVEMENT = """\
 The probability that a run of ours reaches more goals than a run of the other method, over all arenas; ties count half

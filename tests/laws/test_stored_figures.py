@@ -77,6 +77,29 @@ def test_a_stored_table_is_of_the_stored_cells(path: Path) -> None:
                 assert row[name]["low"] <= row[name]["value"] <= row[name]["high"]
 
 
+@pytest.mark.parametrize("name", ["README.md", "docs/results.md"])
+def test_the_pages_say_how_often_the_recordings_collided_and_what_all_goals_mean(name: str) -> None:
+    text = " ".join((ROOT / name).read_text().split())
+    training = {
+        robot: json.loads((RESULTS / robot / "table.json").read_text())["parts"]["training"] for robot in ROBOTS
+    }
+    ground, air = ({row: part[row]["pre-training collisions"] for row in part} for part in training.values())
+    said = f"SAILR {ground['sailr']:,} (ground) and {air['sailr']:,} (air), SECAS {ground['secas']:,} and"
+    assert f"{said} {air['secas']:,}, ours {max(ground['ddpc'], air['ddpc'])}" in text
+    assert {sum(counts(cells(robot, "ddpc"), "default", "goal")) for robot in ROBOTS} == {2499}
+    assert "2,499 of 2,500 episodes" in text
+
+
+def test_the_page_counts_the_recorded_periods_of_sac_behind_our_filter() -> None:
+    ground, air = (cells(robot, "sac-ddpc")[0]["model"]["samples"] for robot in ROBOTS)
+    with_recording = [
+        f"{int(samples) + np.mean(learned(cells(robot, 'sac-ddpc'))):,.0f}"
+        for robot, samples in zip(ROBOTS, (ground, air), strict=True)
+    ]
+    text = " ".join((ROOT / "docs/results.md").read_text().split())
+    assert "it needs {} periods on the ground and {} in the air".format(*with_recording) in text
+
+
 @pytest.mark.parametrize(
     ("decision", "folder"), [("closest input", "closest_input/ground"), ("turning aside", "ground")]
 )
