@@ -71,16 +71,9 @@ FAILURES = {
     "refused": Refused(pb.Error(type="BadRequest", field="payload", message="not a request batch")),
     "error": pb.Reply(error=pb.Error(type="StaleModel", field="model", message="never in use here")),
     "empty": pb.Reply(),
-    "no kind": decision(kind=pb.UNKNOWN),
-    "short plan": decision(PLAN[:2]),
-    "not a number": decision(np.where(PLAN == 0.1, np.nan, PLAN)),
-    "infinite": decision(np.where(PLAN == 0.1, np.inf, PLAN)),
-    "out of bounds": decision(PLAN * 10),
     "backwards": decision(-PLAN),
     "no stop at its end": decision(np.ones((3, 2)) * 0.1),
-    "no prediction": decision(predicted_center=[]),
-    "another robot's": pb.Reply(robot="quadrotor", decision=decision().decision),
-}
+}  # `test_malformed_replies.py` has the other malformed replies
 
 
 @pytest.mark.parametrize("failure", FAILURES.values(), ids=FAILURES.keys())

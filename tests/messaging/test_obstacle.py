@@ -106,6 +106,16 @@ def test_distances_are_those_of_each_obstacle_if_any_at_each_point():
 
 
 NAN, INF = float("nan"), float("inf")
+MALFORMED = (
+    Motion(("0.5", "0"), 0.1, speed=1.0),
+    Motion((0.0,), 0.0, speed=1.0),
+    Motion((0.0, NAN), 0.0, speed=1.0),
+    Motion((0.0, 0.0), -1.0, speed=1.0),
+    Motion((0.0, 0.0), 0.0),
+    Motion((0.0, 0.0), 0.0, acceleration=1.0, speed=1.0),
+    Motion((0.0, 0.0), 0.0, acceleration=INF),
+    Motion((0.0, 0.0), 0.0, speed=1.0, before=Sighting((0.0,), (0.0, 0.0), 0.2)),
+)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +143,7 @@ NAN, INF = float("nan"), float("inf")
         ("yaw", (BOX, (0, 0), (1, 1), "left")),
         ("margin", (BOX, (0, 0), (1, 1), 0.0, None)),
         ("motion", (BOX, (0, 0), (1, 1), 0.0, 0.0, (0.5, 0.0))),
-        ("motion", (BOX, (0, 0), (1, 1), 0.0, 0.0, Motion(("0.5", "0"), 0.1, speed=1.0))),
+        *(("motion", (BOX, (0, 0), (1, 1), 0.0, 0.0, motion)) for motion in MALFORMED),
     ],
 )
 def test_what_is_no_obstacle_in_the_plane_is_refused_by_its_field(field, arguments):

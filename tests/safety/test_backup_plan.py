@@ -71,11 +71,6 @@ def test_after_a_violation_the_proposal_may_still_be_verified_from_the_new_measu
     assert decision.kind == ALLOWED and decision.compared and not decision.contained
 
 
-def test_standing_still_needs_no_token(ready):
-    decision = ready.decide(request(obstacles=[cylinder(0.2, 0)]))
-    assert decision.kind == FAILSAFE and decision.verified and not decision.plan.any()
-
-
 def test_a_plan_counts_until_the_robot_stands():
     backup_plan, turning = BackupPlan(GROUND), np.array([[0.2, 0.1], [0, 0], [0, 0]])
     assert backup_plan.model == ""

@@ -160,14 +160,15 @@ def test_a_masked_number_is_missing(ready):
         safety.decide(state, [0.25, 0.0], known_free=True)
 
 
-@pytest.mark.parametrize("deadline", [float("nan"), float("inf"), -1.0, 0.0, 1e300, None, "0.1"])
-def test_a_deadline_that_no_query_can_have_is_refused(join, endpoint, deadline):  # noqa: F811
+def test_a_deadline_that_no_query_can_have_is_refused(join, endpoint):  # noqa: F811
     bus = join("safety", listen=True)
-    for make in (lambda: SafetyClient(bus, "ground", deadline), lambda: FleetClient(bus, "ground", NAMES, deadline)):
+    for deadline in (float("nan"), float("inf"), -1.0, 0.0, 1e300, None, "0.1"):
         with pytest.raises(ValueError, match="a deadline is"):
-            make()
-    with pytest.raises(ValueError, match="a deadline is"):
-        SafetyClient.open(endpoint, "ground", deadline)
+            SafetyClient(bus, "ground", deadline)
+        with pytest.raises(ValueError, match="a deadline is"):
+            FleetClient(bus, "ground", NAMES, deadline)
+        with pytest.raises(ValueError, match="a deadline is"):
+            SafetyClient.open(endpoint, "ground", deadline)
 
 
 @pytest.mark.parametrize(

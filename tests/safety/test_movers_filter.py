@@ -145,12 +145,14 @@ def pushing(k, rng, near):
 
 
 def contacts(ready, policy, seed, sees=True):
-    """Return the contacts while the robot moved and while it stood, judged by the discs at every substep."""
+    """Return the contacts while the robot moved and while it stood, judged by the discs at every substep.
+
+    The drive ends with the first contact while the robot moves.
+    """
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed)
     rng = np.random.default_rng(seed)
     robot, watch, safety = Unicycle((0.0, 0.0, 0.0), rng), CrowdSensor(crowd, rng), InProcess(ready, accept_bound=1.0)
-    moving = standing = 0
-    touching = False
+    standing, touching = 0, False
     for k in range(300):
         state = robot.measure()
         measured = watch.measure(k * GROUND.period)
@@ -165,9 +167,11 @@ def contacts(ready, policy, seed, sees=True):
             now = bool((np.linalg.norm(there - at, axis=1) < KIND.radius + GROUND.footprint).any())
             if now and not touching:
                 still_stood = not u.any() and max(abs(start[3]), abs(robot.state[3])) <= STANDING
-                moving, standing = moving + (not still_stood), standing + still_stood
+                if not still_stood:
+                    return 1, standing
+                standing += 1
             touching = now
-    return moving, standing
+    return 0, standing
 
 
 @pytest.mark.parametrize("policy", [wild, pushing])

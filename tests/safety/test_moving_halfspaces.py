@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.errors import BadShape
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
@@ -150,21 +149,3 @@ def test_a_mover_that_breaks_its_bound_is_inconsistent_with_its_last_sighting():
 
     assert consistent(0.2) and consistent(0.24) and not consistent(0.25) and not consistent(0.15)
     assert consistent(0.2, (1.2, 0.05)) and not consistent(0.2, (1.25, 0.0))
-
-
-@pytest.mark.parametrize(
-    "motion",
-    [
-        Motion((0.0,), 0.0, speed=1.0),
-        Motion((0.0, np.nan), 0.0, speed=1.0),
-        Motion((0.0, 0.0), -1.0, speed=1.0),
-        Motion((0.0, 0.0), 0.0),
-        Motion((0.0, 0.0), 0.0, acceleration=1.0, speed=1.0),
-        Motion((0.0, 0.0), 0.0, acceleration=np.inf),
-        Motion((0.0, 0.0), 0.0, speed=1.0, before=Sighting((0.0,), (0.0, 0.0), 0.2)),
-    ],
-)
-def test_a_malformed_motion_is_refused(motion):
-    with pytest.raises(BadShape) as error:
-        Obstacle("sphere", (0.0, 0.0), (0.3,), motion=motion)
-    assert error.value.field == "motion"

@@ -315,12 +315,15 @@ def test_a_step_that_resets_a_robot_compares_and_costs_nothing() -> None:
     arenas = BatchNavigationEnv(GROUND, 8, "dense", autoreset_mode=AutoresetMode.NEXT_STEP)
     env = BatchSafetyWrapper(arenas, SAFETY, penalty=1.0)
     env.reset(seed=0)
-    rng, resets, ended = np.random.default_rng(0), 0, np.zeros(8, dtype=bool)
-    while resets < 4 or not ended.any():
+    arenas._step_limit = 12
+    arenas._steps[::2] += 5  # episodes of every second robot end in the seventh step
+    rng, ended = np.random.default_rng(0), np.zeros(8, dtype=bool)
+    for _ in range(12):
         _, rewards, terminated, truncated, infos = env.step(rng.uniform([0.2, -0.5], [0.25, 0.5], (8, 2)))
         assert not (infos["compared"][ended].any() or infos["penalty"][ended].any() or rewards[ended].any())
         assert infos["compared"][~ended].all()
-        resets, ended = resets + ended.sum(), terminated | truncated
+        ended = terminated | truncated
+    assert ended.tolist() == [False, True] * 4
     env.reset(seed=1)
     env.step(np.tile([0.2, 0.0], (8, 1)))
     assert env.plans.input_in_force[:, 0].all(), "no robot is reset again"

@@ -292,11 +292,6 @@ def test_odometry_of_another_time_counts_as_missing(inputs, now, message):
         inputs.state(9.95, now)
 
 
-def test_an_old_scan_counts_as_missing(inputs):
-    with pytest.raises(InputMissing, match=r"the scan is 0\.70 s old"):
-        inputs.obstacles(np.zeros(2), 10.7)
-
-
 def test_the_oldest_beam_of_a_scan_counts_as_its_age(inputs):
     """Some drivers state the end of a turn as its time, and a negative time between two beams."""
     for turn, refused in ((0.5, False), (0.8, True)):

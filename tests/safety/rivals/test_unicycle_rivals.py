@@ -15,7 +15,7 @@ from brakeline.safety.model.model_config import CBF, PSF
 from brakeline.safety.rivals.predictive_filter import PredictiveFilter
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
-from tests.robots import GROUND
+from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, request
 
 BARRIER = UnicycleBarrier(Pretrained(GROUND, CBF, {}, asdict(BarrierConfig(0.05, 1.0, 0.0))))
@@ -121,11 +121,12 @@ def test_a_setting_of_a_task_that_a_rival_lacks_is_refused():
         config_for(CBF, with_task(GROUND, task))
 
 
+@pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.name)
 @pytest.mark.parametrize("name", [CBF, PSF])
-def test_their_models_hold_settings_and_cost_no_recording(name):
-    config = config_for(name, GROUND)
-    model = pretrain(GROUND, config)
-    assert made_by(model, GROUND, config) and not made_by(model, GROUND, replace(config, margin=0.5))
+def test_their_models_hold_settings_and_cost_no_recording(name, robot):
+    config = config_for(name, robot)
+    model = pretrain(robot, config)
+    assert made_by(model, robot, config) and not made_by(model, robot, replace(config, margin=0.5))
     assert (model.about["samples"], model.about["collisions"], dict(model.networks)) == ("0", "0", {})
     again = decode(model.encode())
     assert again.version == model.version and ready(again).settings == ready(model).settings
