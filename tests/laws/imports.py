@@ -57,6 +57,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "safety.perception.displayed_map",
     ),  # protobuf
     "scipy": ("deploy", "logs", "safety.model", "sim"),
+    "highspy": ("safety.model.linear_program",),
     "pydantic": ("deploy", "messaging"),
     "safetensors": ("learner", "messaging.policy_weights", "safety.model.tensor_file"),
     "zenoh": ("messaging.bus", "messaging.ros2"),
