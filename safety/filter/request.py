@@ -18,11 +18,11 @@ from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
+from brakeline.safety.filter.obstacle_checks import check_movers, check_shapes
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
 from brakeline.safety.filter.scan_checks import check_scan
 from brakeline.safety.filter.widening import PastWindow
 
-FLOAT = np.dtype(float)
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
 FEW = 64  # numbers, up to which a loop is faster than NumPy
@@ -30,10 +30,6 @@ NOT_FINITE = "the proposed action holds NaN or infinity"  # the reason of a fail
 NOTHING_KNOWN = (
     "nothing is known of the space around the robot: give obstacles, or a scan, or say known_free if a map says that "
     "all space within reach is free"
-)
-IMPOSSIBLE = (
-    "an obstacle has a negative size, axes that are not orthonormal, a rounding that is not 0 or 1, or a number that "
-    "is infinite or too large"
 )
 SEND_LAST = "send the prediction of the last decision as it is, or none"
 EXECUTED = "state inputs as the robot executes them, in the units of its description"
@@ -226,7 +222,7 @@ def check_surroundings(robot: Robot, request: Request) -> None:
     Raises:
         BadRequest: the description is missing or does not fit the robot. It has the field's name.
     """
-    moving = request.movers is not None and len(request.movers)
+    moving = request.movers is not None and len(request.movers.shapes)
     if not isinstance(request.known_free, bool | np.bool_):  # a text such as "no" is true
         raise BadRequest("known_free", f"known_free is a {type(request.known_free).__name__}: give True or False")
     if not robot.position_dim:
@@ -241,40 +237,11 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         _check_past(robot, request.past)
     if not robot.position_dim:
         return
-    if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
-        raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
-    for shapes in (request.obstacles, None if request.movers is None else request.movers.shapes):
-        if shapes is None:
-            continue
-        _check_arrays(robot, shapes)
-        if len(shapes) and not _plausible(shapes):
-            raise BadRequest("obstacles", IMPOSSIBLE)
+    check_shapes(robot, request.obstacles)
+    if request.movers is not None:
+        check_movers(robot, request.movers)
     if request.scan is not None:
         check_scan(robot, request.state, request.scan)
-
-
-def _check_arrays(robot: Robot, shapes: Shapes) -> None:
-    """Check the arrays of obstacles: compiled code would read past the end of one that is too short.
-
-    Raises:
-        BadRequest: an array has another shape or type.
-    """
-    n, d = len(shapes), robot.position_dim
-    if shapes.center.shape[1:] != (d,):
-        raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {d} coordinates")
-    sizes = {"center": (n, d), "axes": (n, d, d), "half": (n, d), "rho": (n,), "round": (n, d), "margin": (n,)}
-    for name, size in sizes.items():
-        part = getattr(shapes, name)
-        if part.shape != size or part.dtype is not FLOAT or not part.flags.writeable:
-            found = f"shape {part.shape} and type {part.dtype}{'' if part.flags.writeable else ', read-only'}"
-            why = f"obstacles.{name} has {found}; {n} obstacles need {size} and float64, writable: use Shapes.of"
-            raise BadRequest("obstacles", why)
-
-
-def _plausible(shapes: Shapes) -> bool:
-    from brakeline.safety.filter.kernels import shape_kernels  # here, since clients need no compiled code
-
-    return shape_kernels.plausible(*shapes.parts, np.ascontiguousarray(shapes.margin))
 
 
 def _check_no_space(robot: Robot, request: Request) -> None:

@@ -190,3 +190,20 @@ def test_a_filter_touches_movers_that_it_does_not_see_if_it_stands_too_soon_or_i
     monkeypatch.setattr(MovingObstacles, "moved", lambda self, times: np.zeros((len(self), len(times), 2)))
     monkeypatch.setattr(MovingObstacles, "radius", lambda self, times: np.zeros((len(self), len(times))))
     assert contacts(Filter(model), wild, 0)[0] > 0
+
+
+WRONG = [
+    *(("growth", np.full((1, 3), value)) for value in (-10.0, np.nan)),
+    *(("age", np.array([value])) for value in (-1e9, np.nan, np.inf)),
+    *(("drift", np.array([[value, 0.0]])) for value in (np.nan, np.inf)),
+    *(("drift", np.zeros((0, 2))), ("growth", np.zeros((0, 3))), ("growth", np.zeros((1, 2)))),
+    *(("age", np.zeros(0)), ("consistent", np.zeros(0, dtype=bool)), ("consistent", np.ones(1))),
+]
+
+
+@pytest.mark.parametrize(("part", "value"), WRONG)
+def test_arrays_of_motions_that_leave_an_obstacle_out_are_refused(ready, part, value):
+    """Without a drift, or with a negative growth, a mover ahead was nowhere, and full speed was allowed."""
+    _, movers = split_moving([walker(0.35)], 2)
+    with pytest.raises(BadRequest, match="mov"):
+        ready.decide(request(obstacles=Shapes.of([], 2), movers=replace(movers, **{part: value})))
