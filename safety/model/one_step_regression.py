@@ -60,7 +60,6 @@ class Regression:
                 self._cross[i] += phi.T @ s.y[some]
         self._paths: dict[int, list[SelectionPath]] = {}
         self._fits: dict[tuple[float, bool, int], OneStep] = {}
-        self._most = ABSURD * np.abs(s.after).max((0, 1))
 
     def fit(self, candidate: Candidate, without: int = -1, weight: float = 0.0) -> OneStep:
         """Return the predictor that is fitted to all folds but one, with a weight of the leverage."""
@@ -119,9 +118,10 @@ class Regression:
 
     def diverges(self, candidate: Candidate, z: Array) -> bool:
         """Return whether a fit to all folds, or to all but one, leads absurdly far away in one of these windows z."""
+        most = ABSURD * np.abs(self._s.after).max((0, 1))
         fits = (self.fit(candidate, without=i) for i in (*self.folds, -1))
         # NaN diverges, too
-        return not all((np.abs(one_step.rollouts(self._robot, z)) <= self._most).all() for one_step in fits)
+        return not all((np.abs(one_step.rollouts(self._robot, z)) <= most).all() for one_step in fits)
 
     def out_of_fold(self, candidate: Candidate, s: Samples) -> Array:
         """Return the errors (T, N, n + d·discs) of windows, each predicted without its fold."""

@@ -286,3 +286,16 @@ def test_the_table_of_fewer_corrections_has_the_stored_figures() -> None:
         figures = [str(len(stored)), f"{np.mean(learned(stored)):,.0f}", percents(stored, "goal")]
         figures += [percents(stored, "interventions"), f"{steps:.1f}"]
         assert rows[label] == [*figures, f"{100 * np.mean(collided):.1f} %" if collided else "–"], label
+
+
+def test_psf_is_no_better_with_a_larger_margin() -> None:
+    folder, page = RESULTS / "psf_margins" / "quadrotor", (ROOT / "docs" / "results_quadrotor.md").read_text()
+    own, *larger = (
+        json.loads((folder / f"tuning-psf-{margin}.json").read_text()) for margin in ("0.6", "0.8", "1", "1.5")
+    )
+    assert {row["oracle_goals"] for row in (own, *larger)} == {own["episodes"]} == {120}
+    assert own["greedy_collisions"] == 1
+    collisions = [row["greedy_collisions"] for row in larger]
+    assert f"With 0.8, 1 and 1.5 m, it has {collisions[0]}, {collisions[1]} and {collisions[2]}" in page
+    shares = [f"{100.0 * row['oracle_interventions']:.1f} %" for row in (*larger, own)]
+    assert "{}, {} and {} of A*'s steps instead of {}".format(*shares) in " ".join(page.split())
