@@ -203,7 +203,9 @@ def test_invalid_commands_are_skipped_the_flight_goes_on_and_its_end_brakes_the_
         reply = vehicle._ask(misshapen)
         assert reply is not None and reply.error.type == "BadMessage" and not reply.in_time
         after = vehicle.wait(vehicle.current_period.number + 3)
-        assert not after.input.any() and (not after.lost or stalled() > STALL), "no invalid plan was flown"
+        assert not after.input.any(), "no invalid plan was flown"
+        # On a busy machine, the server's process may wait: no command makes a gap in the telemetry.
+        assert not after.lost or after.lost.startswith("no telemetry"), "no invalid command ended the flight"
         until(lambda: not vehicle.wait(vehicle.current_period.number + 1).lost, "the flight goes on")
         until(lambda: rejected.count >= 11, "the server's count")
         plan, speeds = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]]), []
