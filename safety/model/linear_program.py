@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import ErrorBoundError
+
 Array = NDArray[np.float64]
 
 OPTIMAL, UNBOUNDED, INFEASIBLE = "optimal", "unbounded", "infeasible"  # the states of a program
@@ -41,15 +43,26 @@ class LinearProgram:
         self._solver.addVars(variables, np.full(variables, least), np.full(variables, np.inf))
 
     def add(self, rows: Array, low: Array, high: Array) -> None:
-        """Add constraints low (k,) <= rows (k, n) · x <= high (k,)."""
+        """Add constraints low (k,) <= rows (k, n) · x <= high (k,).
+
+        Raises:
+            ErrorBoundError: a number is NaN, infinite or too large. HiGHS would leave out the constraint.
+        """
+        from highspy import HighsStatus
+
         count, n = rows.shape
-        starts = np.arange(0, rows.size, n, dtype=np.int32)
-        self._solver.addRows(count, low, high, rows.size, starts, np.tile(self._places, count), rows.ravel())
+        starts, places = np.arange(0, rows.size, n, dtype=np.int32), np.tile(self._places, count)
+        status = self._solver.addRows(count, low, high, rows.size, starts, places, rows.ravel())
+        if status == HighsStatus.kError or not np.isfinite(rows).all():
+            raise ErrorBoundError("a linear program holds NaN, infinity or a number that is too large")
 
     def minimise(self, cost: Array) -> tuple[str, Array]:
         """Return the state of the program with this cost (n,), and x (n,), which has a meaning only if it is OPTIMAL.
 
         The state is UNBOUNDED, INFEASIBLE, or HiGHS's own word for anything else.
+
+        Raises:
+            ErrorBoundError: the cost is not finite.
         """
         from highspy import HighsModelStatus
 
@@ -59,6 +72,8 @@ class LinearProgram:
             HighsModelStatus.kUnboundedOrInfeasible: UNBOUNDED,
             HighsModelStatus.kInfeasible: INFEASIBLE,
         }
+        if not np.isfinite(cost).all():
+            raise ErrorBoundError("a linear program's cost holds NaN or infinity")
         self._solver.changeColsCost(len(self._places), self._places, cost)
         self._solver.run()
         if self._solver.getModelStatus() not in known:  # a basis may have become singular

@@ -22,6 +22,7 @@ from brakeline.safety.model.error_bounds import (
     set_membership,
     whitening,
 )
+from brakeline.safety.model.linear_program import LinearProgram
 from brakeline.safety.model.validation import facet_normals
 from tests.safety.linear import PUBLISHED, count_outside, double_integrator, lti5
 
@@ -280,6 +281,16 @@ def test_the_residual_certificate_bounds_its_samples():
     y = z @ rng.normal(size=(3, 2)) + 0.01 * np.sin(5.0 * z[:, :2]) * np.abs(z[:, :1])
     bound = residual(z, y, least_squares(z, y))
     assert (np.abs(y - z @ bound.C.T) <= bound.half_widths(z)).all()
+
+
+@pytest.mark.parametrize(("value", "low"), [(np.nan, 0.0), (np.inf, 0.0), (1e20, 0.0), (1.0, np.nan)])
+def test_a_linear_program_refuses_what_its_solver_would_leave_out(value, low):
+    """HiGHS takes NaN for zero, and leaves out a constraint with infinity or a very large number."""
+    program = LinearProgram(2, least=0.0)
+    with pytest.raises(ErrorBoundError, match="NaN"):
+        program.add(np.array([[value, 2.0]]), np.array([low]), np.array([np.inf]))
+    with pytest.raises(ErrorBoundError, match="cost"):
+        program.minimise(np.array([np.nan, 1.0]))
 
 
 # --- the facets of a zonotope ---------------------------------------------------------------------------------------
