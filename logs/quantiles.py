@@ -12,15 +12,18 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
+
+Moments = tuple[int, float, float]  # count, sum, and sum of the squared deviations from the mean
 
 RATIO = 1.01  # of the edges of a bin
 RESOLUTION = 0.005  # largest relative error of a percentile
 TINY = 1e-9  # a smaller absolute value counts as zero
-HUGE = 1e15  # a larger absolute value counts as not finite: its square could overflow the sum
+HUGE = 1e15  # a larger absolute value counts as not finite: its squared deviation could overflow
 BAR = 1.25  # ratio of the edges of a bar in a chart, about
 BATCH = 1024  # values sorted into bins at once
 
@@ -35,6 +38,19 @@ def _middle(place: int) -> float:
     return math.copysign(math.exp((abs(place) + 0.5 - _SHIFT) / _PER_E), place)
 
 
+def _moments(values: NDArray[np.float64]) -> Moments:
+    """Return the moments of values, at least one."""
+    off = values - values.mean()
+    return len(values), float(values.sum()), float(off @ off)
+
+
+def _joined(parts: Sequence[Moments]) -> Moments:
+    """Return the moments of all values from those of the parts."""
+    count, total = sum(part[0] for part in parts), math.fsum(part[1] for part in parts)
+    apart = (size * (own / size - total / count) ** 2 for size, own, _ in parts if size)
+    return count, total, math.fsum([*(part[2] for part in parts), *apart])
+
+
 @dataclass
 class QuantileSketch:
     """A histogram with logarithmic bins: about 3,000 bins for values over twelve decades.
@@ -43,7 +59,9 @@ class QuantileSketch:
     the floating-point sums do not depend on how often a program reads them.
 
     Attributes:
-        total, squares: sum of the values and of their squares.
+        total: sum of the values.
+        scatter: sum of their squared deviations from the mean. Sums of squares would lose the digits of a small
+            deviation (Chan, Golub and LeVeque 1983).
         low, high: smallest and largest value.
         not_finite: number of values that are NaN or above `HUGE`; no other attribute includes them.
         bins: count by number of the bin.
@@ -51,7 +69,7 @@ class QuantileSketch:
 
     count: int = 0
     total: float = 0.0
-    squares: float = 0.0
+    scatter: float = 0.0
     low: float = math.inf
     high: float = -math.inf
     not_finite: int = 0
@@ -80,9 +98,8 @@ class QuantileSketch:
         values = values[finite]
         if not len(values):
             return
-        self.count += len(values)
-        self.total += float(values.sum())
-        self.squares += float(values @ values)
+        batch = _moments(values)
+        self.count, self.total, self.scatter = _joined([(self.count, self.total, self.scatter), batch])
         self.low = min(self.low, float(values.min()))
         self.high = max(self.high, float(values.max()))
         sizes = np.abs(values)
@@ -96,7 +113,7 @@ class QuantileSketch:
 
     @property
     def std(self) -> float:
-        return math.sqrt(max(0.0, self.squares / self.count - self.mean**2))
+        return math.sqrt(self.scatter / self.count)
 
     def percentile(self, percent: float) -> float:
         """Return the inverse of the empirical distribution function at `percent`.
@@ -136,10 +153,11 @@ def merged(parts: Iterable[QuantileSketch]) -> QuantileSketch:
     bins: Counter[int] = Counter()
     for part in parts:
         bins.update(part.bins)
+    count, total, scatter = _joined([(part.count, part.total, part.scatter) for part in parts])
     return QuantileSketch(
-        count=sum(part.count for part in parts),
-        total=math.fsum(part.total for part in parts),
-        squares=math.fsum(part.squares for part in parts),
+        count=count,
+        total=total,
+        scatter=scatter,
         low=min((part.low for part in parts), default=math.inf),
         high=max((part.high for part in parts), default=-math.inf),
         not_finite=sum(part.not_finite for part in parts),

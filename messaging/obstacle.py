@@ -141,6 +141,13 @@ class Shapes(ComparedByValue):
         return whole(self.center), whole(self.axes), whole(self.half), whole(self.rho), whole(self.round)
 
     @staticmethod
+    def sizes(n: int, dim: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape that each array has for n obstacles in `dim` dimensions."""
+        vectors, numbers = (n, dim), (n,)
+        axes = (n, dim, dim)
+        return {"center": vectors, "axes": axes, "half": vectors, "rho": numbers, "round": vectors, "margin": numbers}
+
+    @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
         """Stack obstacles that stand. `split_moving` separates them from those that move.
 

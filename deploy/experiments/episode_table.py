@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from operator import add
 
+from brakeline.logs.quantiles import QuantileSketch, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
 CONTACTS = ("contact_moving", "contact_standing")
@@ -52,8 +53,7 @@ class EpisodeTable:
     rows: list[dict[str, float]] = field(default_factory=list)
     spans: list[tuple[int, int]] = field(default_factory=list)
     decisions: int = 0
-    milliseconds: float = 0.0
-    squares: float = 0.0  # ms²
+    times: QuantileSketch = field(default_factory=QuantileSketch)  # decision times [ms]
     _running: dict[str, tuple[int, dict[str, float]]] = field(default_factory=dict)  # by actor: begin, row
 
     def step(self, step: pb.Step) -> None:
@@ -63,10 +63,8 @@ class EpisodeTable:
         begin, row = self._running[step.actor]
         for name, column in self.which.items():
             row[name] = column.combine(row[name], column.value(step))
-        spent = COLUMNS["milliseconds"].value(step)
         self.decisions += 1
-        self.milliseconds += spent
-        self.squares += spent * spent
+        self.times.add(COLUMNS["milliseconds"].value(step))
         if step.terminated or step.truncated:
             del self._running[step.actor]
             self.rows.append(row)
@@ -95,5 +93,5 @@ class EpisodeTable:
 
     def decision_ms(self) -> dict[str, float]:
         """Return the mean and the standard deviation of the decision times [ms]."""
-        mean = self.milliseconds / max(self.decisions, 1)
-        return {"mean": mean, "std": max(self.squares / max(self.decisions, 1) - mean * mean, 0.0) ** 0.5}
+        whole = summary(self.times)
+        return {name: whole[name] if whole else 0.0 for name in ("mean", "std")}

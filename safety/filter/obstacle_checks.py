@@ -25,8 +25,7 @@ def check_shapes(robot: Robot, shapes: Shapes) -> None:
     n, d = len(shapes), robot.position_dim
     if shapes.center.shape[1:] != (d,):
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {d} coordinates")
-    sizes = {"center": (n, d), "axes": (n, d, d), "half": (n, d), "rho": (n,), "round": (n, d), "margin": (n,)}
-    for name, size in sizes.items():
+    for name, size in Shapes.sizes(n, d).items():
         part = getattr(shapes, name)
         if part.shape != size or part.dtype is not FLOAT or not part.flags.writeable:
             found = f"shape {part.shape} and type {part.dtype}{'' if part.flags.writeable else ', read-only'}"

@@ -14,6 +14,13 @@ from brakeline.errors import ErrorBoundError
 Array = NDArray[np.float64]
 
 OPTIMAL, UNBOUNDED, INFEASIBLE = "optimal", "unbounded", "infeasible"  # the states of a program
+KNOWN = {  # the state for each of HiGHS's own
+    "Optimal": OPTIMAL,
+    "Unbounded": UNBOUNDED,
+    "Primal infeasible or unbounded": UNBOUNDED,
+    "Infeasible": INFEASIBLE,
+}
+NOT_FINITE = "a linear program holds NaN, infinity or a number that is too large"
 TOLERANCE = 1e-9  # of constraints and of reduced costs
 OPTIONS: dict[str, bool | int | float | str] = {
     "output_flag": False,
@@ -50,11 +57,13 @@ class LinearProgram:
         """
         from highspy import HighsStatus
 
+        if not np.isfinite(rows).all():
+            raise ErrorBoundError(NOT_FINITE)
         count, n = rows.shape
         starts, places = np.arange(0, rows.size, n, dtype=np.int32), np.tile(self._places, count)
         status = self._solver.addRows(count, low, high, rows.size, starts, places, rows.ravel())
-        if status == HighsStatus.kError or not np.isfinite(rows).all():
-            raise ErrorBoundError("a linear program holds NaN, infinity or a number that is too large")
+        if status == HighsStatus.kError:
+            raise ErrorBoundError(NOT_FINITE)
 
     def minimise(self, cost: Array) -> tuple[str, Array]:
         """Return the state of the program with this cost (n,), and x (n,), which has a meaning only if it is OPTIMAL.
@@ -64,21 +73,15 @@ class LinearProgram:
         Raises:
             ErrorBoundError: the cost is not finite.
         """
-        from highspy import HighsModelStatus
-
-        known = {
-            HighsModelStatus.kOptimal: OPTIMAL,
-            HighsModelStatus.kUnbounded: UNBOUNDED,
-            HighsModelStatus.kUnboundedOrInfeasible: UNBOUNDED,
-            HighsModelStatus.kInfeasible: INFEASIBLE,
-        }
         if not np.isfinite(cost).all():
             raise ErrorBoundError("a linear program's cost holds NaN or infinity")
         self._solver.changeColsCost(len(self._places), self._places, cost)
         self._solver.run()
-        if self._solver.getModelStatus() not in known:  # a basis may have become singular
+        if self._state() not in KNOWN.values():  # a basis may have become singular
             self._solver.clearSolver()
             self._solver.run()
-        state = self._solver.getModelStatus()
-        words = known.get(state) or self._solver.modelStatusToString(state)
-        return words, np.array(self._solver.getSolution().col_value)
+        return self._state(), np.array(self._solver.getSolution().col_value)
+
+    def _state(self) -> str:
+        state = self._solver.modelStatusToString(self._solver.getModelStatus())
+        return KNOWN.get(state, state)

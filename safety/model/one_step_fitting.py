@@ -47,7 +47,7 @@ WEIGHTS = (1.0, 3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 PLANS_EVERY = 4  # from every fourth of these windows, plans whose sets are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
-DIVERGENT = "every predictor of one period leads absurdly far away over a plan: record more driving"
+ALL_DIVERGE = "every predictor of one period leads absurdly far away over a plan: record more driving"
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
 
 
@@ -123,7 +123,7 @@ def _simple(choices: list[tuple[Choice, Regression]], z: Array) -> tuple[Choice,
         if len(z) <= MOST_TO_CHOOSE or not regression.diverges(choice.candidate, z):
             return choice, regression
         choices = [pair for pair in choices if pair[0] is not choice]
-    raise BadData(DIVERGENT)
+    raise BadData(ALL_DIVERGE)
 
 
 def _good_candidates(candidates: list[tuple[Candidate, Regression]], z: Array) -> list[tuple[Candidate, Regression]]:
@@ -139,7 +139,7 @@ def _good_candidates(candidates: list[tuple[Candidate, Regression]], z: Array) -
         if not regression.diverges(candidate, z):
             good.append((candidate, regression))
     if not good:
-        raise BadData(DIVERGENT)
+        raise BadData(ALL_DIVERGE)
     return good
 
 

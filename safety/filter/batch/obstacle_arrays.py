@@ -92,9 +92,7 @@ class ObstacleArrays:
 
     def row_shapes(self, d: int) -> dict[str, tuple[int, ...]]:
         """Return the shape that one row of each array has, in d dimensions."""
-        K = self.slots
-        shapes = {"center": (K, d), "axes": (K, d, d), "half": (K, d), "rho": (K,), "round": (K, d), "margin": (K,)}
-        return shapes | {"count": ()}
+        return Shapes.sizes(self.slots, d) | {"count": ()}
 
     @staticmethod
     def of(shapes: Sequence[Shapes]) -> ObstacleArrays:
