@@ -13,7 +13,7 @@ import tyro
 from rich.markdown import Markdown
 
 from brakeline.deploy.commands.command_output import console, print_json
-from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed, given_settings
+from brakeline.deploy.commands.common_options import Json, Mode, Quiet, Unprefixed, given_settings
 from brakeline.deploy.experiments.compared_methods import SAC_LEARNER, SAC_SETTINGS, compared
 from brakeline.deploy.experiments.comparison_cells import (
     RESULTS,
@@ -30,6 +30,7 @@ from brakeline.deploy.progress import say
 from brakeline.deploy.run.run_config import SEEDS, Internal
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.atomic_files import write_atomically
+from brakeline.safety.model.model_config import ModelConfig
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.conservatism import Conservatism
@@ -71,6 +72,9 @@ class CompareCommand:
     backend: Literal["single", "batch"] | None = None
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""
+    mode: Mode | None = None
+    """Filter with model sets of this mode, where our filter does. Defaults to direct, for a robot of your own to auto,
+    the mode that was last put to use. Give another --results folder if you change it."""
     at_once: int | None = None
     """Train this many robots at once, where a batch trains. Defaults to the number in the robot's task. If you change
     it, give another --results folder."""
@@ -169,7 +173,7 @@ class CompareCommand:
                     raise ValueError(f"--{mode} ignores {', '.join(dict.fromkeys(unused))}: leave these options out")
 
     def _prepared(self, cells: list[CellConfig], results: Path) -> list[CellConfig]:
-        """Make the models that several trainings need, and note the model set of a robot of your own.
+        """Make the models that several trainings need, and note a model set that does not come with Brakeline.
 
         Raises ResultError: the cells do not compare with the stored ones.
         """
@@ -186,7 +190,10 @@ class CompareCommand:
             if isinstance(model, OwnCode):
                 model.ready()  # code that cannot be loaded ends the command before the first training
         versions = {method: model.version for method, model in models.items()}
-        noted = [replace(one, model_set=versions[DDPC]) if one.task and DDPC in one.filters() else one for one in cells]
+        noted = [
+            replace(one, model_set=versions[DDPC]) if DDPC in one.filters() and not one.of_shipped_set() else one
+            for one in cells
+        ]
         noted = [replace(one, code=versions[one.method]) if is_own_code(one.method) else one for one in noted]
         if not self.quick:
             check_addable(results, noted)
@@ -227,6 +234,8 @@ class CompareCommand:
         for label in {compared(cell.method).label for cell in cells if compared(cell.method).learner == SAC_LEARNER}:
             if ignored:
                 say(robot, f"{label} has no {', '.join(ignored)}: it learns without")
+        if self.mode is not None:
+            changed["model_config"] = ModelConfig(mode=self.mode)
         own = [replace(cell, td3=learning(self.td3, cell.method, cell.robot, settings, self.given)) for cell in cells]
         chosen = [replace(quick(cell, self.given) if self.quick else cell, **changed) for cell in own]
         conservatism = self.conservatism and not self.quick and TRAINED in stored_policies(described)

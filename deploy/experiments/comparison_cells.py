@@ -79,7 +79,7 @@ class CellConfig:
     physics: int = 1  # version of the simulator (`Task.simulator_version`); results of different ones do not compare
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
     task: str = ""  # see `experiment_jobs.task_hash`
-    # Version of the model set that filters a robot of your own. Empty: no trial needs one, or the robot is ours.
+    # Version of the model set that filters. Empty: no trial needs one, or it is of the usual mode of a robot of ours.
     model_set: str = ""
     code: str = ""  # version of a filter of your own (`OwnCode`); empty: no such filter
 
@@ -91,6 +91,10 @@ class CellConfig:
     @property
     def name(self) -> str:
         return f"{short_name(self.method)}-s{self.seed}"
+
+    def of_shipped_set(self) -> bool:
+        """Return whether our filter has the usual settings for a robot that comes with Brakeline."""
+        return not self.task and self.model_config == ModelConfig()
 
     def trials(self) -> list[TrialConfig]:
         """Return the evaluations for the table, then those that add or remove the filter after training."""

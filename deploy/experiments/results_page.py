@@ -28,7 +28,7 @@ from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.logs.run_groups import aggregate, probability_of_improvement
 from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.model.model_config import DDPC, SAILR
+from brakeline.safety.model.model_config import DDPC, DIRECT, SAILR
 
 Result = dict[str, Any]
 
@@ -86,7 +86,14 @@ def page(results: Path, robots: Sequence[str]) -> str:
     """Return the page about the robots that have stored cells."""
     stored = {name: cells for name in robots if (cells := stored_cells(results, name))}
     sections = [_section(results, RobotResults(name, cells)) for name, cells in stored.items()]
-    return "\n".join([HEAD, *sections, THREATS, COMMANDS])
+    configs = [cell["study"].get("model_config", {}) for cells in stored.values() for cell in cells if _ours(cell)]
+    modes = sorted({config.get("mode", DIRECT) for config in configs}) or [DIRECT]
+    threats = THREATS.format(modes=" and ".join(f"`{mode}`" for mode in modes))
+    return "\n".join([HEAD, *sections, threats, COMMANDS])
+
+
+def _ours(cell: Result) -> bool:
+    return compared(cell["study"]["method"]).filter == DDPC
 
 
 def _section(results: Path, robot_results: RobotResults) -> str:
@@ -342,7 +349,7 @@ THREATS = """## Threats to validity
 - **Our own task.** The arenas, the reward and the observation are ours. So is the learner, except SAC, whose
   implementation is Stable-Baselines3's.
 - **Own implementations of rivals.** They differ from their authors' versions as `docs/rivals.md` says.
-- **Ours is not the article's version.** Ours has model sets of mode `direct` with the error bound `residual`. The
+- **Ours is not the article's version.** Ours has model sets of mode {modes} with the error bound `residual`. The
   article's recursion with matrix zonotopes gives sets that are too wide for these tasks (`conservatism.md` beside the
   tables).
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded

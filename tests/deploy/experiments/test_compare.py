@@ -456,6 +456,8 @@ def test_a_robot_of_ones_own_is_compared_behind_the_model_set_in_use_and_in_the_
     assert (cell.model_config.mode, cell.arenas, others) == ("auto", ("default",), []), "no policy is stored"
     (cell,), others = CompareCommand(methods=("ddpc",), seeds=(0,))._jobs("ground")
     assert (cell.model_config.mode, cell.arenas, len(others)) == ("direct", ("default", "dense"), 1)
+    (cell,), others = CompareCommand(methods=("ddpc",), seeds=(0,), mode="one-step")._jobs("ground")
+    assert cell.model_config.mode == "one-step" and not cell.of_shipped_set()
     with pytest.raises(UnknownName, match="no arena is called 'dense'"):
         CompareCommand(methods=("ddpc",), seeds=(0,), arenas=("dense",))._jobs(skid)
     with pytest.raises(ValueError, match="has no greedy"):
@@ -468,14 +470,15 @@ def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_p
     for module in (model_store, cell_run):
         monkeypatch.setattr(module, "method_for", lambda *_: in_use)
 
-    def noted(robot, methods=("ddpc", "none", "sailr"), seeds=(0,)):
-        command = CompareCommand(methods=methods, seeds=seeds, conservatism=False)
+    def noted(robot, methods=("ddpc", "none", "sailr"), seeds=(0,), mode=None):
+        command = CompareCommand(methods=methods, seeds=seeds, conservatism=False, mode=mode)
         return command._prepared(command._jobs(robot)[0], tmp_path)
 
     car = str(folder / "car.toml")
     before = noted(car)
     assert [cell.model_set for cell in before] == ["first", "first", ""], "TD3 is also run with our filter"
     assert {cell.model_set for cell in noted("ground")} == {""}, "stored results of shipped robots stay"
+    assert [cell.model_set for cell in noted("ground", mode="one-step")] == ["first", "first", ""]
     for cell in before:
         write(tmp_path, cell, {"study": configuration(cell), "model": None})
     in_use.version = "second"
