@@ -39,7 +39,7 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import EPISODE
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.safety.methods import Model
-from brakeline.safety.model.model_config import DDPC, SAILR
+from brakeline.safety.model.model_config import DDPC, ONE_STEP, SAILR
 from brakeline.safety.rivals.own_code import OwnCode
 from brakeline.safety.rivals.pretrained import Pretrained
 
@@ -230,7 +230,9 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, Any]:
         about = {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
         source = {"obstacles": model.ready().obstacles} if isinstance(model, OwnCode) else {}
         return about | source | {"settings": dict(model.settings)}
-    return {"samples": str(load_or_record(robot).steady().periods), "collisions": "0"}
+    data = load_or_record(robot)
+    used = data if model.model_config.mode == ONE_STEP else data.steady()  # as `certify` uses them
+    return {"samples": str(used.periods), "collisions": "0"}
 
 
 def _checked(table: EpisodeTable, log_file: Path) -> dict[str, Any]:

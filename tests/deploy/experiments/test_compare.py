@@ -542,3 +542,11 @@ def test_options_that_make_no_sense_or_do_nothing_are_refused(command, words, mo
     monkeypatch.setattr(compare_command, "complete", lambda *_: pytest.fail("a job began"))
     with pytest.raises(ValueError, match=words):
         command.run()
+
+
+@pytest.mark.parametrize(("mode", "counted"), [("one-step", "10"), ("direct", "6")])
+def test_a_cell_counts_the_recorded_periods_that_its_model_set_was_fitted_to(monkeypatch, mode, counted):
+    """Mode one-step also uses the restless trajectories, which were left out of the count."""
+    recorded = SimpleNamespace(periods=10, steady=lambda: SimpleNamespace(periods=6))
+    monkeypatch.setattr(cell_run, "load_or_record", lambda robot: recorded)
+    assert cell_run._cost(SimpleNamespace(model_config=ModelConfig(mode=mode)), GROUND)["samples"] == counted
