@@ -55,6 +55,7 @@ class RunAnalysis:
         self.options = options or AnalysisOptions()
         self.metrics = Metrics(robots=log.robots)
         self.training: defaultdict[str, LearningCurve] = defaultdict(LearningCurve)  # by robot kind
+        self.outcomes_stated = False
         self.driving = DrivingStats(log.robots, log.metadata)
         self.intervention_maps: dict[str, InterventionMap] = {}
         self.samplers: dict[str, EpisodeSampler] = {}
@@ -62,6 +63,7 @@ class RunAnalysis:
         self._received = 0  # when the recorder received the message in hand, without jumps of its clock [ns]
         self._buffers: dict[LogChannel, tuple[EpisodeSampler, ActorBuffer]] = {}
         self._read(log)
+        self.outcomes_stated |= log.metadata.get("run", {}).get("policy") != OWN_PROGRAM
         for sampler in self.samplers.values():
             sampler.close()
         self._buffers.clear()
@@ -85,13 +87,13 @@ class RunAnalysis:
     def _read(self, log: Log) -> None:
         """Read all messages in one loop."""
         handlers: dict[str, Callable[[LogChannel, Any], None]] = {
-            STEP.name: lambda channel, step: self.training[channel.robot].step(step),
+            STEP.name: self._step,
             EXCHANGE.name: self._exchange,
             LEARNER.name: lambda _, metrics: self._learner(metrics),
         }
         if self.options.pictures or self.options.episode is not None:
             handlers |= {
-                STEP.name: self._step,
+                STEP.name: self._drawn_step,
                 EXCHANGE.name: self._drawn_exchange,
                 EPISODE.name: lambda channel, episode: self._buffer(channel)[1].about.append(episode),
                 HEALTH.name: lambda _, health: self.timeline.health(health, self._received),
@@ -115,6 +117,11 @@ class RunAnalysis:
 
     def _step(self, channel: LogChannel, step: Any) -> None:
         self.training[channel.robot].step(step)
+        # A log from before the field states what it has.
+        self.outcomes_stated |= step.outcome_stated or step.goal or step.collision or step.reward != 0.0
+
+    def _drawn_step(self, channel: LogChannel, step: Any) -> None:
+        self._step(channel, step)
         sampler, buffer = self._buffer(channel)
         sampler.step(buffer, step)
         self.timeline.step(self._received)
@@ -143,6 +150,11 @@ class RunAnalysis:
             self._buffers[channel] = sampler, sampler.source(channel.actor)
         return self._buffers[channel]
 
+    def learning(self, robot: str) -> Figures:
+        """Return the learning curves of a kind of robot, without outcomes if none is stated."""
+        curves = self.training[robot].figures()
+        return curves if self.outcomes_stated else without_outcomes(curves)
+
     def about(self) -> Figures:
         """Return one row about the run: configuration, figures, missing messages."""
         metrics, log, topics = self.metrics, self.log, self.metrics.topics().values()
@@ -152,8 +164,9 @@ class RunAnalysis:
             setup["perception"] = perception_in(conditions)
         if setup["seed"] is not None and setup["seed"].lstrip("-").isdigit():
             setup["seed"] = int(setup["seed"])
+        figures = closed_loop([metrics.actors[name] for name in sorted(metrics.actors)])
         return {
-            **mark_outcomes(setup | closed_loop([metrics.actors[name] for name in sorted(metrics.actors)])),
+            **marked(setup | figures, self.outcomes_stated),
             "seconds": metrics.seconds(),
             **{name: sum(topic[name] for topic in topics) for name in ("messages", "missing", "duplicates")},
             "files": len(log.paths),
@@ -187,16 +200,21 @@ def cuts_in(log: Log) -> list[str]:
     return [*(str(cut) for cut in log.cuts), *jumps]
 
 
-def mark_outcomes(figures: Figures) -> Figures:
+def marked(figures: Figures, stated: bool) -> Figures:
     """Return figures with `outcomes_stated`: whether the log says how its episodes ended.
 
     A program of your own states outcomes and rewards with `record_outcome` and `reset`. If it states none at all, their
     counts are zero because nobody counted, so they have no intervals.
     """
-    names = ("goals", "collisions", "mean_reward")
-    stated = figures["policy"] != OWN_PROGRAM or any(figures[name] for name in names)
     nothing = {} if stated else {"intervals": figures["intervals"] | dict.fromkeys(ENDS)}
     return figures | nothing | {"outcomes_stated": stated}
+
+
+def without_outcomes(training: Figures) -> Figures:
+    """Return learning curves without goals, collisions and rewards, which nobody stated."""
+    nothing = dict.fromkeys(("goals", "collisions", "reward"))
+    bins = [row | dict.fromkeys(("goals", "reward")) for row in training["bins"]]
+    return training | {"bins": bins, "last": training["last"] | nothing}
 
 
 def perception_in(conditions: Mapping[str, str]) -> str:
@@ -225,10 +243,11 @@ class LogAnalysis:
         details = [picture for sampler in samplers for picture in sampler.requested_episodes]
         prefixes = [part.prefix if len(self.parts) > 1 else "" for part in self.parts]
         merged = merge_runs({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
+        stated = any(part.outcomes_stated for part in self.parts)
         return {
-            **mark_outcomes(_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP) | merged),
+            **marked(_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP) | merged, stated),
             "training": {
-                prefix + robot: part.training[robot].figures()
+                prefix + robot: part.learning(robot)
                 for prefix, part in zip(prefixes, self.parts, strict=True)
                 for robot in sorted(part.training)
             },

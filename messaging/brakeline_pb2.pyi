@@ -469,7 +469,7 @@ class Request(_message.Message):
     widening: _builtins.float
     """factor on every set of the tube, at least 1; 0: not given, so 1"""
     state_widening: _builtins.float
-    """factor on the set of the next state, if it is larger than `widening`; 0: not given"""
+    """the same for speeds and the like in the next state's set, at least `widening`; 0: not given"""
     past_from_start: _builtins.bool
     """that window began within `horizon` periods of the episode's start, or of a gap"""
     slow: _builtins.float
@@ -1025,6 +1025,7 @@ class Step(_message.Message):
     FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
     CLOSEST_FIELD_NUMBER: _builtins.int
     ACCELERATION_AGE_FIELD_NUMBER: _builtins.int
+    OUTCOME_STATED_FIELD_NUMBER: _builtins.int
     LOST_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
@@ -1083,6 +1084,8 @@ class Step(_message.Message):
     """m, least clearance at the physics samples of the period; absent: a log from before"""
     acceleration_age: _builtins.float
     """s: the horizontal acceleration in `state` is the one of this long ago"""
+    outcome_stated: _builtins.bool
+    """in a log of a program of its own: it stated the reward, or how the episode ended"""
     lost: _builtins.bool
     """in real time: the vehicle did not follow the action, or its state is not known"""
     @_builtins.property
@@ -1151,11 +1154,12 @@ class Step(_message.Message):
         for_clearance: _builtins.bool | None = ...,
         closest: _builtins.float | None = ...,
         acceleration_age: _builtins.float = ...,
+        outcome_stated: _builtins.bool = ...,
         lost: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "closest", b"closest", "for_clearance", b"for_clearance", "header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "acceleration_age", b"acceleration_age", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "closest", b"closest", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "lost", b"lost", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "acceleration_age", b"acceleration_age", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "closest", b"closest", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "lost", b"lost", "next_observation", b"next_observation", "observation", b"observation", "outcome_stated", b"outcome_stated", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__closest: _TypeAlias = _typing.Literal["closest"]  # noqa: Y015
     _WhichOneofArgType__closest: _TypeAlias = _typing.Literal["_closest", b"_closest"]  # noqa: Y015

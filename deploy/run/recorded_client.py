@@ -165,13 +165,21 @@ class RecordedClient:
         """
         reward = reward if abs(reward) < MAX_VALUE else 0.0
         if self._pending is not None:
-            self._pending.reward, self._pending.goal, self._pending.collision = reward, goal, collision
+            step = self._pending
+            step.reward, step.goal, step.collision, step.outcome_stated = reward, goal, collision, True
         elif self._latest is not None:  # `decide` failed, and the program stops the robot without `fallback`
-            _add_outcome(self._unmeasured, pb.Step(reward=reward, goal=goal, collision=collision))
+            stated = pb.Step(reward=reward, goal=goal, collision=collision, outcome_stated=True)
+            _add_outcome(self._unmeasured, stated)
 
-    def reset(self, *, goal: bool = False, collision: bool = False) -> None:
-        """End the episode and begin the next one with a robot that stands still. The arguments say how it ended."""
-        self._end_episode(goal, collision)
+    def reset(self, *, goal: bool | None = None, collision: bool | None = None) -> None:
+        """End the episode and begin the next one with a robot that stands still.
+
+        The arguments say how the episode ended. Without them, `analyse` counts outcomes only if `record_outcome` stated
+        them.
+        """
+        if (goal, collision) != (None, None):
+            self._unmeasured.outcome_stated = True
+        self._end_episode(bool(goal), bool(collision))
         self.client.reset()
 
     def close(self) -> None:
@@ -287,6 +295,7 @@ def _add_outcome(step: pb.Step, other: pb.Step) -> None:
     """Add the outcome of another period to that of a step."""
     step.reward += other.reward
     step.goal, step.collision = step.goal or other.goal, step.collision or other.collision
+    step.outcome_stated = step.outcome_stated or other.outcome_stated
 
 
 def _recording(path: Path, client: FilterClient, inbox: Inbox) -> Recording:

@@ -259,6 +259,27 @@ def test_the_table_of_other_settings_has_the_stored_figures() -> None:
     assert tied >= set(OTHERS)
 
 
+def test_the_table_of_minutes_of_driving_has_the_stored_figures() -> None:
+    """*With the recording* adds the periods that were recorded before; TD3 has none."""
+    rows = table_rows("docs/results.md", "| robot | recorded before |")
+    assert [row[0] for row in rows] == ["ground", "quadrotor"]
+    for robot, recorded, _, number, *figures in rows:
+        stored, alone = cells(f"minutes/{robot}", "ddpc"), cells(robot, "none")
+        assert {(cell["study"]["model_config"]["mode"], cell["study"]["steps"]) for cell in stored} == {
+            ("one-step", alone[0]["study"]["steps"])
+        }
+        (samples,) = {int(cell["model"]["samples"]) for cell in stored}
+        evaluated = [sum(counts(stored, arena, "collision")) for arena in ("default", "dense")]
+        training = [cell["training"]["episodes"]["collision"] for cell in stored]
+        collided = f"{sum(evaluated)}; {sum(map(sum, training))} of {sum(map(len, training)):,}"
+        steps, without = np.mean(learned(stored)), np.mean(learned(alone))
+        assert recorded.endswith(f" {samples:,} periods") and number == str(len(stored))
+        assert figures == [
+            percents(stored, "goal"), percents(stored, "interventions"), collided, f"{steps:,.0f}",
+            f"{samples + steps:,.0f}", f"{without:,.0f}",
+        ]  # fmt: skip
+
+
 FEWER = {  # rows of the table of fewer corrections, likewise
     "ours, neither": ("fewer_corrections/neither/quadrotor", "ddpc"),
     "ours, imitation 1": ("fewer_corrections/imitation/quadrotor", "ddpc"),

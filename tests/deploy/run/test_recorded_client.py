@@ -273,7 +273,25 @@ def test_what_the_program_never_stated_is_not_recorded(method, tmp_path, figures
     assert status == 0 and "not recorded" in out and "timeouts" not in out
     assert not re.search(r"collisions +0", out)
     page = (tmp_path / "report.html").read_text()
-    assert "not recorded" in page and 'data-figure="collisions' not in page
+    assert "not recorded" in page and 'data-figure="collisions' not in page and "mean reward" not in page
+    (training,) = run["training"].values()
+    assert training["last"]["collisions"] is None is training["bins"][0]["goals"]
+
+
+@pytest.mark.parametrize("by", ["record_outcome", "reset"])
+def test_outcomes_count_as_stated_also_if_nothing_was_reached_or_hit(method, tmp_path, figures, command, by) -> None:
+    """The usual case of a program without rewards: `analyse` said that it had not called what it had called."""
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        for _ in range(2):
+            for _ in range(4):
+                safety.decide([0] * 5, [0.0, 0.0], known_free=True)
+                if by == "record_outcome":
+                    safety.record_outcome(0.0)
+            safety.reset(**({"collision": False} if by == "reset" else {}))
+    run = figures("analyse", safety.path)
+    assert run["outcomes_stated"] and (run["collisions"], run["timeouts"]) == (0, 2)
+    assert run["intervals"]["collisions"] == pytest.approx([0.0, 0.842], abs=1e-3)
+    assert "not recorded: the program" not in command("analyse", safety.path)[1]
 
 
 def test_after_close_nothing_is_decided_unrecorded_and_the_robot_brakes(method, tmp_path) -> None:
