@@ -28,7 +28,7 @@ def main(kind: str = "csv") -> None:
         brakeline(["import", str(log), "--robot", str(robot)])
         brakeline(["certify", str(robot), "--use"])
 
-        filter = Filter.load(folder / "data" / "my-robot" / "residual-one-step.safetensors")
+        filter = Filter.load(folder / "data" / "my-robot" / "residual-one-step.safetensors", robot)
         print(f"a full stop from full speed is known to {100.0 * filter.half_width(filter.robot.high()):.0f} cm")
         safety = InProcess(filter)
         decide(safety, 2.0)

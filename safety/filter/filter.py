@@ -23,7 +23,7 @@ import numpy as np
 
 from brakeline.errors import BadRequest
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.robot import Array
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import MAX_SCAN_AGE
 from brakeline.safety.filter.clearance_margin import ClearanceMargin
 from brakeline.safety.filter.constraints import TubeConstraints
@@ -48,8 +48,9 @@ from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.filter.standing import DRIVES_ALREADY, may_drive_already, stands
 from brakeline.safety.filter.turning_aside import find_plan
 from brakeline.safety.filter.window_score import WindowScore
+from brakeline.safety.model.model_loading import load_model
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
-from brakeline.safety.model.stated_bound import check_bound, stated_bound
+from brakeline.safety.model.stated_bound import stated_bound
 from brakeline.safety.model.turning_in_place import widened
 from brakeline.safety.perception.image_coverage import unseen_poles
 
@@ -128,24 +129,24 @@ class Filter:
         self.clearance_margin, self.reach = margin.largest, self.constraints.reach  # m
 
     @classmethod
-    def load(cls, source: Path | str, *, accept_bound: float | None = None) -> Filter:
+    def load(
+        cls, source: Path | str, robot: Robot | Path | str | None = None, *, accept_bound: float | None = None
+    ) -> Filter:
         """Return a filter with the model set in a file, or with the one that comes with a shipped robot.
 
         Args:
             source: the path of a model set, or the name of a shipped robot (`"ground"`, `"quadrotor"`).
-            accept_bound: the largest stated share of plans outside their tubes that you accept; by default the limit
-                in the robot's description.
+            robot: your robot's description (`"my.toml"`), to refuse a model set of an earlier one. Always give it.
+            accept_bound: the largest accepted share of plans outside their tubes. Defaults to the description's limit.
 
         Raises:
-            BadModel: the file holds no model set, or no shipped robot has that name.
+            BadModel: the file holds no model set, no shipped robot has that name, or the description is another one.
             TooLoose: the model set states a larger share than is accepted.
 
         >>> Filter.load("ground").robot.name
         'ground'
         """
-        model = ModelSet.load(source)
-        check_bound(model, model.robot, accept_bound)
-        return cls(model)
+        return cls(load_model(source, robot, accept_bound))
 
     def half_width(self, speed: Array) -> float:
         """Return the largest half-width [m] of the last set of the tube for a full stop from inputs `speed` (m,).

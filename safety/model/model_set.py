@@ -299,7 +299,7 @@ def path_of_model(source: Path | str) -> Path:
     if path.suffix == ".toml":
         raise BadModel(
             f"{path} is a description: give the model set that `brakeline certify {quote(str(path))} --use` wrote, "
-            "such as data/NAME/residual-one-step.safetensors"
+            "such as data/NAME/residual-one-step.safetensors; Filter.load takes the description as its second argument"
         )
     if isinstance(source, str) and source == path.name and not path.suffix:
         shipped = SHIPPED / f"{source}.model.safetensors"
