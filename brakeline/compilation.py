@@ -54,7 +54,10 @@ def _forget_stale(function: Callable[..., object]) -> None:
         return
     compiled_later = njit(cache=True)(function)
     if stats := getattr(compiled_later, "stats", None):  # None with NUMBA_DISABLE_JIT=1
-        _forget(Path(stats.cache_path), _sources())
+        stored = Path(stats.cache_path)
+        _forget(stored, _sources())
+        if not any(stored.glob("*.nbi")):
+            _say_that_it_compiles()
     _checked.add(folder)
 
 
@@ -81,6 +84,12 @@ def _sources() -> str:
     for path in sorted(kernels | {path for path in imported if path.exists()}):
         digest.update(str(path.relative_to(here)).encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
+
+
+@cache
+def _say_that_it_compiles() -> None:
+    """Log, once in a process, that it compiles: nothing else moves meanwhile."""
+    log.warning("Brakeline compiles its loops for this computer, once: this takes about a minute")
 
 
 @cache

@@ -70,6 +70,7 @@ def unmeasured_holds(robot: Robot) -> str:
 def remarks(robot: Robot) -> list[str]:
     """Return remarks on settings that are valid but probably not intended."""
     distance = nominal_stopping_distance(robot) or 0.0
+    error = max(robot.measurement_bound[: robot.position_dim], default=0.0)
     no_standing = robot.horizon == robot.free_steps + robot.brake_steps
     free = [label for label, index in zip(robot.action, robot.follows, strict=True) if index < 0]
     candidates = (
@@ -82,6 +83,11 @@ def remarks(robot: Robot) -> list[str]:
             robot.position_dim > 0 and distance + robot.footprint > robot.sight,
             f"sight: a stop from full speed takes about {distance:.2f} m and the body reaches {robot.footprint:.2f} m, "
             f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving.",
+        ),
+        (
+            2.0 * error > robot.sight,
+            f"state: a position has an error of {error:g} m, but the robot sees obstacles from {robot.sight:g} m only. "
+            "A tube begins with this error, so the filter will hardly verify anything. Is the error in m?",
         ),
         (
             no_standing and RAMP in robot.stop,

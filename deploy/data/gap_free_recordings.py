@@ -53,6 +53,7 @@ def gap_free_recordings(
     names, input_names = column_names(robot)
     recordings: list[GapFreeRecording] = []
     gaps = lost = silent = jumps = shared = 0
+    cut_in = dict.fromkeys(names, 0)
     for run in sorted({int(i) for table, _ in places.values() for i in np.unique(table.run)} or {0}):
         states, given = (
             [table.series(column, run) for table, column in (places[name] for name in columns)]
@@ -67,7 +68,9 @@ def gap_free_recordings(
         jumping = sum(map(len, jump_rows.values())) + unreachable
         _refuse_several_robots(jumping, sum(len(states[i][0]) for i in jump_rows))
         shared += moving
-        gaps += len(cuts[0])
+        gaps += max(map(len, cuts))
+        for name, at in zip(names, cuts, strict=True):
+            cut_in[name] += len(at)
         jumps += len({float(states[i][0][j]) for i, indices in jump_rows.items() for j in indices})
         spans = [_uncut(time, at) for (time, _), at in zip(states, cuts, strict=True)]
         spans += [_uncut(states[i][0], indices) for i, indices in jump_rows.items()]
@@ -85,14 +88,21 @@ def gap_free_recordings(
             if all(len(time) >= 2 for time, _ in part):
                 recordings.append(GapFreeRecording(part, inputs, begin, end))
     counts = {
-        "gaps in the stamps, at which the recording is cut: {}": gaps,
+        "gaps, at which the recording is cut: {}": gaps,
         "jumps of the pose, at which the recording is cut: {}": jumps,
         "changes of an input while messages of it are missing, at which the recording is cut: {}": lost,
         f"pauses of more than {hold:g} s between messages of an input: {{}}. The recording leaves out what follows "
         f"these {hold:g} s. If the robot keeps an input until the next message, give a larger --hold": silent,
         "rows with the stamp of the row before and another pose, which are left out: {}": shared,
     }
-    return recordings, [note.format(count) for note, count in counts.items() if count]
+    missing = [_missing_cells(name, *places[name]) for name, count in cut_in.items() if count]
+    return recordings, [note.format(count) for note, count in counts.items() if count] + list(filter(None, missing))
+
+
+def _missing_cells(name: str, table: Table, column: str) -> str:
+    """Return a note on the rows in which a column has no value. Empty: it has one in all."""
+    share = float(np.mean(~np.isfinite(table.columns[column][np.isfinite(table.time)])))
+    return f"{name} is empty or NaN in {share:.1%} of the rows: the recording is cut at them" if share else ""
 
 
 def _gaps(time: Array, period: float, name: str) -> Indices:

@@ -31,6 +31,7 @@ from brakeline.errors import NoSource
 FAR_GAIN = {False: 2.0, True: 5.0}  # of a state, of an input: farther from 1 it is another unit
 BACKWARDS = 0.3  # of the usual top speed: a robot that moves so fast against its heading drives backwards
 CONFIRMED = 0.8  # least correlation of a speed with the motion, if its column and those of the pose are right
+NO_RELATION = 0.2  # correlation of speeds with the motion below which the pose must be of something else
 MOVED = {"m/s": 0.2, "rad/s": 0.5}  # range of a speed that the motion must show
 QUANTITIES = {"m/s": "speed", "rad/s": "turn rate"}
 
@@ -64,19 +65,30 @@ def motion_notes(
 
 
 def _unconfirmed(log: AlignedLog, heading: str, units: Mapping[str, str], given: Mapping[str, str]) -> list[str]:
-    """Return notes on measured speeds that agree little with the motion, and on the turn rate if there is only one."""
-    speeds, notes = speeds_of_motion(log, heading), []
+    """Return notes on measured speeds that agree little with the motion, and on the turn rate if there is only one.
+
+    Raises:
+        NoSource: several speeds have no relation to the motion.
+    """
+    speeds, notes, fits = speeds_of_motion(log, heading), [], {}
     measured = {name: unit for name, unit in units.items() if name not in log.inputs}
     several = list(measured.values()).count("rad/s") > 1  # of wheels or joints
     for name, unit in measured.items():
         if unit in QUANTITIES and given.get(name) != AS_IT_IS and not (several and unit == "rad/s"):
-            fit = best_fit(log, name, [s for s in speeds if s[0] == unit], False)
+            fit = fits[name] = best_fit(log, name, [s for s in speeds if s[0] == unit], False)
             if fit.gain and fit.correlation < CONFIRMED and np.ptp(span_means(log, name)) > MOVED[unit]:
                 pose = ", ".join((*log.positions, heading) if heading else log.positions)
                 notes.append(
                     f"{name} agrees little with the motion of {pose} (correlation {max(fit.correlation, 0.0):.2f}): "
                     "unless the robot slips that much, one of these columns is of something else"
                 )
+    if len(fits) > 1 and len(notes) == len(fits) and all(fit.correlation < NO_RELATION for fit in fits.values()):
+        columns = [*log.positions, *([heading] if heading else [])]
+        raise NoSource(
+            f"{', '.join(fits)} have no relation to the motion of {', '.join(columns)}: columns of the pose are "
+            f"swapped, or of something else. Name the right ones with --map {shlex.quote(columns[-1])}=COLUMN, or take "
+            f"the speeds as they are with {unit_option(next(iter(fits)), AS_IT_IS)}"
+        )
     return notes
 
 

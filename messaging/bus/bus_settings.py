@@ -173,6 +173,7 @@ def _unreachable(settings: BusSettings, error: zenoh.ZError) -> Unreachable:
         return Unreachable(f"cannot listen on {', '.join(settings.listen)}: {why}")
     keys = "" if settings.keys is None else ", and that its keys and these are of one authority"
     return Unreachable(
-        f"no router at {', '.join(settings.connect)} within {settings.patience:.0f} s; start one there "
-        f"(any process with --listen), or check --connect{keys}: {why}"
+        f"nothing answered at {', '.join(settings.connect)} within {settings.patience:.0f} s: start a service there "
+        f"(`brakeline safety ROBOT --listen {settings.connect[0]}`, or any other process with --listen), or check "
+        f"--connect{keys} ({why.strip()})"
     )

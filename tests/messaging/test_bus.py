@@ -163,7 +163,7 @@ def test_without_a_router_a_client_says_so_after_its_patience_and_two_routers_ca
     join: Join, stalled: Callable[[], float]
 ) -> None:
     start = time.monotonic()
-    with pytest.raises(Unreachable, match="start one there"):
+    with pytest.raises(Unreachable, match="start a service there"):
         join("actor-0", patience=0.5)
     assert 0.4 < time.monotonic() - start < 3.0 + stalled()
     join("launcher", listen=True)

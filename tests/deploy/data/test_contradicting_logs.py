@@ -72,6 +72,7 @@ def nothing_sent(values):
         (opposite(Y), "Write -heading into the column, or change the sign of y"),
         (clockwise_from_y, "Write pi/2 - heading into the column, or swap the columns x and y"),
         (swap(X, Y), "or swap the columns x and y"),
+        (swap(X, HEADING), "v, w have no relation to the motion of x, y, heading: columns of the pose are swapped"),
         (opposite(W), "w has the opposite sign of the turn rate of the positions"),
         (swap(V, W), "v follows the turn rate of the positions, not their speed: are two columns swapped?"),
         (swap(SPEED, TURN), "speed follows the turn rate of the positions"),

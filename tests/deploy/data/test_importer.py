@@ -1,5 +1,6 @@
 """Recordings of any robot, in any format, become the same data set; and what they lack is said."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -135,11 +136,21 @@ def test_a_note_on_several_files_is_said_once(tmp_path):
         time, values = drive(seconds=20.0, seed=seed)
         kept = np.ones(len(time), dtype=bool) if seed == 4 else (time < 8.0) | (time > 11.0)
         paths.append(write_csv(tmp_path / f"{seed}.csv", time[kept], values[kept]))
-    said = "gaps in the stamps, at which the recording is cut: 1"
+    said = "gaps, at which the recording is cut: 1"
     for some, names in ((paths[:2], "all files"), (paths[1:], "1.csv, 2.csv, 3.csv"), (paths[:1], "")):
         notes = [note for note in import_sources(some, porter()).report.notes if "gaps" in note]
         assert notes == [f"{names}: {said}" if names else said]
     assert f"0.csv, 1.csv, 2.csv and 1 more: {said}" in import_sources(paths, porter()).report.notes
+
+
+def test_a_column_with_missing_cells_is_named(driven):
+    """A tenth of the speeds lost a third of the log, and nothing said why."""
+    time, values = driven[0], driven[1].copy()
+    values[np.random.default_rng(0).random(len(time)) < 0.5, 3] = np.nan
+    notes = resample([table(time, values)], porter(), LogOptions()).report.notes
+    said = [note for note in notes if "empty or NaN" in note]
+    assert len(said) == 1 and re.fullmatch(r"v is empty or NaN in (49|50|51)\.\d% of the rows: .* cut at them", said[0])
+    assert any(re.fullmatch(r"gaps, at which the recording is cut: \d+", note) for note in notes)
 
 
 def test_a_part_of_a_recording_and_a_later_copy_count_as_copies_too(driven):
