@@ -28,6 +28,7 @@ MOTION, ATTITUDE, FORCE, LANDED = "position and velocity", "attitude", "accelera
 COPTER_UNIT, PX4_UNIT = 1e-7 * math.radians(1.0) * 6378100.0, 1e-7 * math.radians(1.0) * 6371000.0
 TRUTH = "truth"  # ground truth of a simulator inside the autopilot
 LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; for a velocity also BODY_NED and BODY_FRD
+UNIT_ERROR = 0.01  # of a quaternion's length
 ON_GROUND, UNKNOWN = 1, 0  # MAV_LANDED_STATE
 
 Message = Any  # pymavlink is untyped
@@ -103,14 +104,26 @@ def _position(m: Message) -> MotionSample:
     return MotionSample(1e-3 * m.time_boot_ms, enu_of((m.x, m.y, m.z)), enu_of((m.vx, m.vy, m.vz)))
 
 
+def _is_unit(attitude: Sequence[float]) -> bool:
+    """Return whether a quaternion is a rotation. Zeros stand for an unknown one, but would turn nothing."""
+    return abs(math.hypot(*attitude) - 1.0) <= UNIT_ERROR
+
+
 def _odometry(m: Message) -> MotionSample | None:
     """Read a pose in the local frame; the velocity may be in the body frame."""
     velocity = (m.vx, m.vy, m.vz)
     if m.frame_id not in LOCAL or m.child_frame_id not in LOCAL + BODY:
         return None
     if m.child_frame_id in BODY:
+        if not _is_unit(m.q):
+            return None
         velocity = rotate(tuple(m.q), velocity)
     return MotionSample(1e-6 * m.time_usec, enu_of((m.x, m.y, m.z)), enu_of(velocity))
+
+
+def _attitude(q: Quaternion) -> Quaternion | None:
+    """Return a quaternion; None: it is no rotation."""
+    return q if _is_unit(q) else None
 
 
 def _euler(m: Message) -> Quaternion:
@@ -132,8 +145,8 @@ def _milligravities(m: Message) -> Vector:
 
 SOURCES: dict[str, tuple[TelemetrySource, ...]] = {
     ATTITUDE: (
-        TelemetrySource("ATTITUDE_QUATERNION", lambda m: (m.q1, m.q2, m.q3, m.q4)),
-        TelemetrySource("ODOMETRY", lambda m: tuple(m.q) if m.frame_id in LOCAL else None),
+        TelemetrySource("ATTITUDE_QUATERNION", lambda m: _attitude((m.q1, m.q2, m.q3, m.q4))),
+        TelemetrySource("ODOMETRY", lambda m: _attitude(tuple(m.q)) if m.frame_id in LOCAL else None),
         TelemetrySource("ATTITUDE", _euler),
     ),
     FORCE: (

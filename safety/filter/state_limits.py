@@ -111,12 +111,19 @@ class StateLimits:
 
 
 def _middle_of_arc(robot: Robot, number: int) -> float:
-    """Return the middle [rad] of the headings that a limit and its opposite allow; 0 without an opposite."""
+    """Return the middle [rad] of the headings that a limit and its opposite allow; 0 without an opposite.
+
+    If several limits have the same weights, the strictest one counts on each side: a looser one would allow headings
+    that a strict limit forbids, as they are nearest to its arc after a turn.
+    """
     limit = robot.limits[number]
     weight = limit.weights[robot.heading] if robot.heading is not None else 0.0
-    opposite = {other.weights: other.most for other in robot.limits}
-    other = opposite.get(tuple(-value for value in limit.weights))
-    return 0.0 if other is None or not weight else 0.5 * (limit.most - other) / weight
+    opposite = tuple(-value for value in limit.weights)
+    most, other = (
+        min((one.most for one in robot.limits if one.weights == side), default=None)
+        for side in (limit.weights, opposite)
+    )
+    return 0.0 if other is None or most is None or not weight else 0.5 * (most - other) / weight
 
 
 def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:

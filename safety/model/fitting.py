@@ -24,6 +24,7 @@ from brakeline.safety.model.model_config import (
     DIRECT,
     FREE,
     MATRIX_ZONOTOPE,
+    MODES,
     PLAN,
     RECURSION,
     RESIDUAL,
@@ -58,7 +59,7 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
 
     Raises:
         BadData: a check of the data failed.
-        ErrorBoundError: the data do not support this kind of error bound.
+        ErrorBoundError: the data do not support this kind of error bound, or the mode is neither direct nor recursion.
     """
     robot, kind = data.robot, model_config.windows
     _check_mode(robot, model_config)
@@ -100,6 +101,9 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
 
 def _check_mode(robot: Robot, model_config: ModelConfig) -> None:
     """Raise ErrorBoundError if no model set of this mode and these windows predicts the robot."""
+    if model_config.mode not in MODES:
+        mode = model_config.mode
+        raise ErrorBoundError(f"fit_model_set fits no mode {mode}: name direct or recursion (certify: or one-step)")
     if not robot.position_dim:
         raise ErrorBoundError(f"{robot.name} has no position, so this mode predicts nothing of it: use mode one-step")
     if model_config.mode == RECURSION and any(disc.arm for disc in robot.body):

@@ -104,6 +104,16 @@ def test_body_frame_odometry_is_rotated_and_an_unknown_frame_ignored() -> None:
     assert read(odometry(frame=20)) is None and SOURCES[ATTITUDE][1].read(odometry(frame=20)) is None
 
 
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)])
+def test_a_quaternion_that_is_no_rotation_is_no_attitude(q: tuple[float, ...]) -> None:
+    """Zeros counted as a level vehicle that faces north: its body's velocity got a wrong direction."""
+    lost = odometry(child=12)
+    lost.q = list(q)
+    attitude = mavlink.MAVLink_attitude_quaternion_message(0, *q, 0, 0, 0)
+    assert SOURCES[MOTION][1].read(lost) is None
+    assert SOURCES[ATTITUDE][0].read(attitude) is None and SOURCES[ATTITUDE][1].read(lost) is None
+
+
 class ScriptedAutopilot:
     """An autopilot with scripted replies and a clock of its own.
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.environment_episodes import collect
-from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ALLOWED, Request
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
@@ -74,3 +75,20 @@ def test_a_limit_beyond_pi_holds_for_a_heading_that_is_measured_up_to_whole_turn
         assert verified and low < min(headings) and max(headings) < high
         reached = max(headings) > high - 0.1 if side > 0.0 else min(headings) < low + 0.1
         assert reached, "the robot turns up to its limit"
+
+
+@pytest.mark.parametrize("loose_first", [False, True])
+@pytest.mark.parametrize("strict", [-1.0, 1.0])
+def test_a_looser_limit_beside_a_strict_one_allows_no_heading_that_the_strict_one_forbids(strict, loose_first):
+    """With θ ≤ 1, θ ≤ 3 and -θ ≤ 2.9, a heading of 2.5 rad was verified: it met the strict limit after a turn."""
+    mosts = [("loose", strict, 3.0), ("strict", strict, 1.0)][:: 1 if loose_first else -1]
+    sides = [*mosts, ("other side", -strict, 2.9)]
+    robot = car("toy", limit=[{"name": n, "weights": {"heading": w}, "most": most} for n, w, most in sides])
+    safety = Filter(replace(model(), robot=robot))
+
+    def allows(heading):
+        state, stop, free = [0.0, 0.0, strict * heading, 0.0], np.zeros((6, 2)), Shapes.of([], dim=2)
+        return safety.decide(Request(state, stop[0], stop[0], stop, free, known_free=True)).kind == ALLOWED
+
+    allowed = [heading for heading in np.arange(-2.8, 3.2, 0.1) if allows(heading)]
+    assert len(allowed) > 30 and max(allowed) < 1.0

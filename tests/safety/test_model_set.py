@@ -225,6 +225,13 @@ def test_invalid_configurations_and_data_that_support_no_model_are_refused(data)
         fit_model_set(replace(data, trajectories=slow), ModelConfig())
 
 
+@pytest.mark.parametrize("mode", ["auto", "one-step"])
+def test_a_mode_that_is_not_fitted_here_is_refused(data, mode):
+    """A recursion with the name of that mode counted as mode direct: one of eight verified plans of a puck collided."""
+    with pytest.raises(ErrorBoundError, match=f"no mode {mode}.*direct or recursion"):
+        fit_model_set(data, ModelConfig(mode=mode))
+
+
 def test_the_residual_bound_is_the_narrowest_and_the_others_contain_its_fit(models, data, plans):
     w = plans
     widths = {kind: Filter(models[kind, "direct"]).tube.half_widths(w.z[0])[-1].max() for kind in KINDS}
