@@ -90,7 +90,7 @@ class Obstacle:
             raise BadShape("margin", f"an obstacle's margin must be finite, not {self.margin}")
         sizes = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[self.kind]
         if len(self.size) != sizes:
-            raise BadShape("size", f"a {dim}-D {self.kind} has {sizes} sizes, not {len(self.size)}")
+            raise BadShape("size", f"the size of a {dim}-D {self.kind} has length {sizes}, not {len(self.size)}")
         if not all(0.0 < value <= FARTHEST for value in self.size):
             raise BadShape(
                 "size", f"the sizes of a {self.kind} are above 0 and up to {FARTHEST:g} m, not {list(self.size)}"

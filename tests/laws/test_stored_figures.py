@@ -278,6 +278,8 @@ def test_the_table_of_minutes_of_driving_has_the_stored_figures() -> None:
             percents(stored, "goal"), percents(stored, "interventions"), collided, f"{steps:,.0f}",
             f"{samples + steps:,.0f}", f"{without:,.0f}",
         ]  # fmt: skip
+        for page in ("README.md", f"docs/results_{robot}.md"):
+            assert f"{samples + steps:,.0f}" in (ROOT / page).read_text(), page
 
 
 FEWER = {  # rows of the table of fewer corrections, likewise
