@@ -166,7 +166,7 @@ class RunAnalysis:
             setup["seed"] = int(setup["seed"])
         figures = closed_loop([metrics.actors[name] for name in sorted(metrics.actors)])
         return {
-            **marked(setup | figures, self.outcomes_stated),
+            **mark_outcomes(setup | figures, self.outcomes_stated),
             "seconds": metrics.seconds(),
             **{name: sum(topic[name] for topic in topics) for name in ("messages", "missing", "duplicates")},
             "files": len(log.paths),
@@ -200,7 +200,7 @@ def cuts_in(log: Log) -> list[str]:
     return [*(str(cut) for cut in log.cuts), *jumps]
 
 
-def marked(figures: Figures, stated: bool) -> Figures:
+def mark_outcomes(figures: Figures, stated: bool) -> Figures:
     """Return figures with `outcomes_stated`: whether the log says how its episodes ended.
 
     A program of your own states outcomes and rewards with `record_outcome` and `reset`. If it states none at all, their
@@ -245,7 +245,9 @@ class LogAnalysis:
         merged = merge_runs({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
         stated = any(part.outcomes_stated for part in self.parts)
         return {
-            **marked(_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP) | merged, stated),
+            **mark_outcomes(
+                _common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP) | merged, stated
+            ),
             "training": {
                 prefix + robot: part.learning(robot)
                 for prefix, part in zip(prefixes, self.parts, strict=True)

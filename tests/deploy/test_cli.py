@@ -432,6 +432,8 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
     assert not figures("robot", "check", path)["remarks"]
     path.write_text(new.replace("sight = 3.0", "sight = 0.2"))
     assert any(remark.startswith("sight") for remark in figures("robot", "check", path)["remarks"])
+    path.write_text(re.sub(r"(?m)^(x = .*error = )[\d.]+", r"\g<1>3.0", new))
+    assert any("an error of 3 m" in remark for remark in figures("robot", "check", path)["remarks"]), "millimetres"
     limit = '\n[[limit]]\nname = "{}"\nweights = {{ speed = {} }}\nmost = {}\n'
     for text, told in ((limit.format("slow", 1.0, 0.3), False), (limit.format("fast", -1.0, -0.1), True)):
         path.write_text(new + text)
