@@ -102,7 +102,7 @@ def gap_free_recordings(
 def _missing_cells(name: str, table: Table, column: str) -> str:
     """Return a note on the rows in which a column has no value. Empty: it has one in all."""
     share = float(np.mean(~np.isfinite(table.columns[column][np.isfinite(table.time)])))
-    said = f"{name} is empty or NaN in {share:.1%} of the rows: where it lacks half a period or more, the recording is cut"
+    said = f"{name} is empty or NaN in {share:.1%} of the rows: where it lacks half a period, the recording is cut"
     return said if share else ""
 
 
