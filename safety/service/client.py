@@ -35,6 +35,7 @@ from brakeline.safety.service.filter_client import (
     scan_in,
     vector_in,
 )
+from brakeline.safety.service.obstacle_frame import ObstacleFrame
 from brakeline.safety.service.plan_token import SIZE
 from brakeline.safety.service.service_query import query_service
 from brakeline.safety.service.wire import array_of, bad_reply, decision_of, reservation_message, reservation_of
@@ -292,6 +293,7 @@ class SafetyClient(BusClient):
         """acceleration_age: your states hold the horizontal acceleration of this long ago [s]."""
         super().__init__(bus, robot, deadline)
         self.backup_plan = BackupPlan(self.robot, acceleration_age=acceleration_age)
+        self._frame = ObstacleFrame(self.robot)
 
     @classmethod
     def open(
@@ -346,11 +348,12 @@ class SafetyClient(BusClient):
             BadRequest: a value has another type; `field` names it.
             NoReply, Late, Refused, SafetyError: there is no decision. Execute `fallback()` instead.
         """
+        listed = None if obstacles is None else obstacles_in(obstacles)
         request = request_message(
             self.backup_plan,
             state,
             action,
-            obstacles,
+            listed,
             scan=scan,
             observation=observation,
             known_free=known_free,
@@ -359,6 +362,7 @@ class SafetyClient(BusClient):
             step=step,
             time=time,
         )
+        self._frame.see(np.array(request.state), listed)
         answer = read_reply(query_service(self.bus, [request], self.deadline)[0], request, self.robot)
         accept(self.backup_plan, answer)
         return answer
@@ -370,3 +374,4 @@ class SafetyClient(BusClient):
     def reset(self) -> None:
         """Begin an episode with a robot that stands still."""
         self.backup_plan.reset()
+        self._frame.reset()

@@ -28,6 +28,7 @@ from brakeline.safety.service.filter_client import (
     scan_in,
     vector_in,
 )
+from brakeline.safety.service.obstacle_frame import ObstacleFrame
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
@@ -62,6 +63,7 @@ class InProcess:
         check_bound(getattr(method, "model", None), method.robot, accept_bound)
         self.method = method
         self.backup_plan = BackupPlan(method.robot, acceleration_age=acceleration_age)
+        self._frame = ObstacleFrame(method.robot)
 
     @property
     def robot(self) -> Robot:
@@ -82,9 +84,11 @@ class InProcess:
         Raises:
             BadRequest, BadShape: a value is missing, not finite, or has the wrong size or type; `field` names it.
         """
+        listed = None if obstacles is None else obstacles_in(obstacles)
         request = self.request(
-            self.backup_plan, state, action, obstacles, scan=scan, observation=observation, known_free=known_free
+            self.backup_plan, state, action, listed, scan=scan, observation=observation, known_free=known_free
         )
+        self._frame.see(request.state, listed)
         return self.decide_all([self.backup_plan], [request])[0]
 
     def decide_all(self, backup_plans: Sequence[BackupPlan], requests: Sequence[Request]) -> list[Answer]:
@@ -109,6 +113,7 @@ class InProcess:
     def reset(self) -> None:
         """Begin an episode with a robot that stands still."""
         self.backup_plan.reset()
+        self._frame.reset()
 
     def request(
         self,
