@@ -266,7 +266,7 @@ class Silent(SafetyClient):
     """A client whose service does not answer."""
 
     def __init__(self):
-        self.robot, self.backup_plan = CAR, BackupPlan(CAR)
+        super().__init__(None, CAR)
 
     def decide(self, *values, **more):
         self.asked = more

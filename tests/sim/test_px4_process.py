@@ -92,7 +92,7 @@ def test_sigterm_during_the_start_of_px4_ends_it_and_leaves_no_files(build, tmp_
     program = [sys.executable, "-m", "brakeline.deploy.cli", *command, last]
     environment = os.environ | {"BRAKELINE_PX4": str(build)}
     running = subprocess.Popen(program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
-    until(lambda: left(build), "the command has begun", 60.0)
+    until(lambda: [*build.parent.glob("tmp/px4-*/bin")], "the command has begun", 60.0)
     running.send_signal(signal.SIGTERM)
     _, err = running.communicate(timeout=20.0)
     assert running.returncode == status and words in err
